@@ -1,0 +1,3 @@
+//! omniloc tells a vehicle where it is from one omnidirectional camera.
+
+pub mod types;
