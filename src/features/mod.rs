@@ -1,0 +1,126 @@
+//! Panorama → descriptor → features.
+//!
+//! A *descriptor* is the vector of image properties y of one panorama; a *feature* is one entry of it after scaling
+//! (whitening or z-score).
+
+mod fft;
+mod histogram;
+mod steerable;
+
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::panorama::Panorama;
+use steerable::{Response, SteerablePyramid};
+
+/// A kind of image properties.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Descriptor {
+    /// Fourier magnitudes along both axes: the paper's FFT.
+    Fft,
+    /// Gray histogram: the paper's Histogram.
+    Hist,
+    /// √ of the histogram.
+    HistSqrt,
+    /// Steerable pyramid: the paper's SP.
+    Sp,
+    /// Logarithm of [`Descriptor::Sp`].
+    SpLog,
+    /// Local energy of the steerable pyramid.
+    SpEnergy,
+}
+
+impl Descriptor {
+    pub const ALL: [Self; 6] = [Self::Fft, Self::Hist, Self::HistSqrt, Self::Sp, Self::SpLog, Self::SpEnergy];
+    /// The three the paper evaluates.
+    pub const PAPER: [Self; 3] = [Self::Fft, Self::Hist, Self::Sp];
+
+    /// Number of properties d.
+    pub fn dimensions(self) -> usize {
+        match self {
+            Self::Fft => fft::DIMENSIONS,
+            Self::Hist | Self::HistSqrt => histogram::DIMENSIONS,
+            Self::Sp | Self::SpLog | Self::SpEnergy => steerable::DIMENSIONS,
+        }
+    }
+
+    /// The name used in arguments, maps and tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fft => "fft",
+            Self::Hist => "hist",
+            Self::HistSqrt => "hist-sqrt",
+            Self::Sp => "sp",
+            Self::SpLog => "sp-log",
+            Self::SpEnergy => "sp-energy",
+        }
+    }
+}
+
+impl fmt::Display for Descriptor {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+#[derive(Debug, thiserror::Error)]
+#[error("unknown feature type `{found}`; known are {}", Descriptor::ALL.map(Descriptor::name).join(", "))]
+pub struct UnknownDescriptor {
+    found: String,
+}
+
+impl FromStr for Descriptor {
+    type Err = UnknownDescriptor;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        let known = Self::ALL.into_iter().find(|descriptor| descriptor.name() == name);
+        known.ok_or_else(|| UnknownDescriptor { found: name.to_owned() })
+    }
+}
+
+impl TryFrom<String> for Descriptor {
+    type Error = UnknownDescriptor;
+
+    fn try_from(name: String) -> Result<Self, Self::Error> {
+        name.parse()
+    }
+}
+
+impl From<Descriptor> for String {
+    fn from(descriptor: Descriptor) -> Self {
+        descriptor.name().to_owned()
+    }
+}
+
+/// Computes descriptors, with the plans and buffers they need: nothing is allocated per frame.
+#[derive(Default)]
+pub struct Describer {
+    fft: fft::FftDescriptor,
+    pyramid: SteerablePyramid<f32>,
+}
+
+impl Describer {
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Fills `properties` with the `descriptor` of `panorama`.
+    ///
+    /// # Panics
+    /// When `properties` is not [`Descriptor::dimensions`] long.
+    pub fn describe(&mut self, descriptor: Descriptor, panorama: &Panorama, properties: &mut [f32]) {
+        assert_eq!(properties.len(), descriptor.dimensions(), "room for the properties of {descriptor}");
+        match descriptor {
+            Descriptor::Fft => self.fft.describe(panorama, properties),
+            Descriptor::Hist => histogram::describe(panorama, properties),
+            Descriptor::HistSqrt => histogram::describe_sqrt(panorama, properties),
+            Descriptor::Sp => self.pyramid.describe(panorama, Response::Magnitude, properties),
+            Descriptor::SpLog => self.pyramid.describe(panorama, Response::LogMagnitude, properties),
+            Descriptor::SpEnergy => self.pyramid.describe(panorama, Response::Energy, properties),
+        }
+    }
+}

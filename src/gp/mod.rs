@@ -1,0 +1,226 @@
+//! Gaussian-process regression over the plane: pure mathematics, knows neither images nor files.
+//!
+//! A feature z is modelled as a smooth field f plus independent noise e, z\[i\] = f(s\[i\]) + e\[i\], at positions s in
+//! metres. [`fit`] finds the hyperparameters that maximise the log marginal likelihood; [`Posterior`] is what is then
+//! known of f anywhere. Several features that share their hyperparameters share one factorization.
+
+pub mod fit;
+mod kernel;
+pub mod minimize;
+
+use faer::linalg::solvers::{Llt, Solve};
+use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
+use faer::{Mat, MatRef, Par, Side};
+
+pub use kernel::{Hyperparameters, squared_exponential};
+
+use crate::types::PositionM;
+
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum GpError {
+    #[error("the covariance matrix of {points} points is not positive definite at {hyperparameters:?}")]
+    NotPositiveDefinite { points: usize, hyperparameters: Hyperparameters },
+}
+
+/// Learning positions with what every feature's fit needs of them.
+#[derive(Debug, Clone)]
+pub struct LearningPositions {
+    positions: Vec<PositionM>,
+    /// (s_i − s_j)² on either axis, n × n \[m²\].
+    squared_distance_m2: [Mat<f64>; 2],
+}
+
+impl LearningPositions {
+    pub fn new(positions: Vec<PositionM>) -> Self {
+        let n = positions.len();
+        let squared_distance_m2 =
+            [0, 1].map(|axis| Mat::from_fn(n, n, |i, j| (positions[i][axis] - positions[j][axis]).powi(2)));
+        Self { positions, squared_distance_m2 }
+    }
+
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+
+    pub fn positions(&self) -> &[PositionM] {
+        &self.positions
+    }
+
+    /// The kernel matrix K, n × n, lower triangle (the upper one is left zero).
+    fn kernel_matrix(&self, hyperparameters: &Hyperparameters) -> Mat<f64> {
+        let n = self.len();
+        let variance = hyperparameters.signal_std.powi(2);
+        let [w1, w2] = hyperparameters.length_scale_m.map(|length_m| -0.5 / (length_m * length_m));
+        let [d1, d2] = &self.squared_distance_m2;
+        let mut k = Mat::zeros(n, n);
+        for j in 0..n {
+            let columns = d1.col(j).iter().zip(d2.col(j).iter()).skip(j);
+            for (value, (d1, d2)) in k.col_mut(j).iter_mut().skip(j).zip(columns) {
+                *value = variance * (w1 * d1 + w2 * d2).exp();
+            }
+        }
+        k
+    }
+
+    /// The Cholesky factor of R = K + σ_e² I.
+    fn factorize(&self, hyperparameters: &Hyperparameters) -> Result<Llt<f64>, GpError> {
+        let mut r = self.kernel_matrix(hyperparameters);
+        let noise_variance = hyperparameters.noise_std.powi(2);
+        for i in 0..self.len() {
+            r[(i, i)] += noise_variance;
+        }
+        r.llt(Side::Lower)
+            .map_err(|_| GpError::NotPositiveDefinite { points: self.len(), hyperparameters: *hyperparameters })
+    }
+}
+
+/// What is known of one or more fields with the same hyperparameters after n observations of each.
+pub struct Posterior<'a> {
+    learning: &'a LearningPositions,
+    hyperparameters: Hyperparameters,
+    factor: Llt<f64>,
+    /// R⁻¹ Z, n × fields.
+    weights: Mat<f64>,
+}
+
+/// Posterior at m points.
+pub struct Prediction {
+    /// m × fields.
+    pub mean: Mat<f64>,
+    /// Variance of the noise-free field at each point, the same for all fields; never negative.
+    pub variance: Vec<f64>,
+}
+
+/// Points predicted at a time: bounds the memory at `n × CHUNK` numbers.
+const CHUNK: usize = 256;
+
+impl<'a> Posterior<'a> {
+    /// `observed`: n × fields.
+    ///
+    /// # Errors
+    /// When R is not positive definite in floating point.
+    pub fn new(
+        learning: &'a LearningPositions,
+        observed: MatRef<f64>,
+        hyperparameters: Hyperparameters,
+    ) -> Result<Self, GpError> {
+        let factor = learning.factorize(&hyperparameters)?;
+        let weights = factor.solve(observed);
+        Ok(Self { learning, hyperparameters, factor, weights })
+    }
+
+    /// Posterior mean and variance, Do et al. (2015), eq. 6:
+    ///
+    /// ```text
+    /// μ*(s) = cᵀ R⁻¹ z        v*(s) = σ_f² − cᵀ R⁻¹ c        c = k(s, S_n)
+    /// ```
+    pub fn predict(&self, points: &[PositionM]) -> Prediction {
+        let n = self.learning.len();
+        let mut mean = Mat::zeros(points.len(), self.weights.ncols());
+        let mut variance = Vec::with_capacity(points.len());
+        for (chunk, points) in points.chunks(CHUNK).enumerate() {
+            let mut c = Mat::from_fn(n, points.len(), |i, j| {
+                squared_exponential(self.learning.positions[i], points[j], &self.hyperparameters)
+            });
+            mean.as_mut()
+                .subrows_mut(chunk * CHUNK, points.len())
+                .copy_from(c.transpose() * &self.weights);
+            solve_lower_triangular_in_place(self.factor.L(), c.as_mut(), Par::Seq);
+            variance.extend((0..points.len()).map(|j| {
+                let explained: f64 = c.col(j).iter().map(|v| v * v).sum();
+                (self.hyperparameters.signal_std.powi(2) - explained).max(0.0)
+            }));
+        }
+        Prediction { mean, variance }
+    }
+
+    /// Leave-one-out residuals z\[i\] − μ₋ᵢ(s\[i\]), n × fields, and the variances they should have, noise included:
+    /// Rasmussen & Williams (2006), eq. 5.12.
+    ///
+    /// ```text
+    /// z_i − μ₋ᵢ = [R⁻¹ z]_i / [R⁻¹]_ii        σ²₋ᵢ = 1 / [R⁻¹]_ii
+    /// ```
+    pub fn leave_one_out(&self) -> (Mat<f64>, Vec<f64>) {
+        let n = self.learning.len();
+        let inverse = self.factor.solve(Mat::<f64>::identity(n, n));
+        let variance: Vec<f64> = (0..n).map(|i| 1.0 / inverse[(i, i)]).collect();
+        let residual = Mat::from_fn(n, self.weights.ncols(), |i, r| self.weights[(i, r)] * variance[i]);
+        (residual, variance)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::golden::{golden, list};
+
+    /// Positions and values of `golden.json`, key `gp`.
+    pub(super) fn golden_gp() -> (LearningPositions, Vec<f64>, Hyperparameters) {
+        let gp = &golden()["gp"];
+        let positions = (0..30)
+            .map(|i| {
+                let i = f64::from(i);
+                [10.0 * (0.618_033_988_749_894_9 * i).fract(), 6.0 * (0.754_877_666_246_692_7 * i).fract()]
+            })
+            .collect();
+        let theta = list(&gp["theta_log_sf_se_l1_l2"]).try_into().expect("four");
+        (LearningPositions::new(positions), list(&gp["z"]), Hyperparameters::from_log(theta))
+    }
+
+    fn column(values: &[f64]) -> Mat<f64> {
+        Mat::from_fn(values.len(), 1, |i, _| values[i])
+    }
+
+    #[test]
+    fn prediction_equals_the_reference_values() {
+        let (learning, z, theta) = golden_gp();
+        let gp = &golden()["gp"];
+        let points: Vec<PositionM> = gp["query"]
+            .as_array()
+            .expect("a list")
+            .iter()
+            .map(|point| list(point).try_into().expect("two coordinates"))
+            .collect();
+        let prediction = Posterior::new(&learning, column(&z).as_ref(), theta).expect("positive definite").predict(&points);
+        for (i, (mean, variance)) in list(&gp["mean"]).iter().zip(list(&gp["var"])).enumerate() {
+            assert!((prediction.mean[(i, 0)] / mean - 1.0).abs() < 1e-6, "{} {mean}", prediction.mean[(i, 0)]);
+            assert!((prediction.variance[i] / variance - 1.0).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn far_away_the_prior_comes_back_and_without_noise_the_data() {
+        let (learning, z, theta) = golden_gp();
+        let noise_free = Hyperparameters { noise_std: 1e-6, ..theta };
+        let posterior = Posterior::new(&learning, column(&z).as_ref(), noise_free).expect("positive definite");
+        let far = posterior.predict(&[[1e4, -1e4]]);
+        assert_eq!(far.mean[(0, 0)], 0.0);
+        assert!((far.variance[0] - theta.signal_std.powi(2)).abs() < 1e-12);
+        let there = posterior.predict(learning.positions());
+        for (i, z) in z.iter().enumerate() {
+            assert!((there.mean[(i, 0)] - z).abs() < 1e-4, "{} {z}", there.mean[(i, 0)]);
+            assert!(there.variance[i] < 1e-6);
+        }
+    }
+
+    #[test]
+    fn leave_one_out_equals_leaving_one_out() {
+        let (learning, z, theta) = golden_gp();
+        let (residual, variance) =
+            Posterior::new(&learning, column(&z).as_ref(), theta).expect("positive definite").leave_one_out();
+        for left in [0, 13, 29] {
+            let others = |i: &usize| *i != left;
+            let rest = LearningPositions::new((0..30).filter(others).map(|i| learning.positions()[i]).collect());
+            let observed: Vec<f64> = (0..30).filter(others).map(|i| z[i]).collect();
+            let prediction = Posterior::new(&rest, column(&observed).as_ref(), theta)
+                .expect("positive definite")
+                .predict(&[learning.positions()[left]]);
+            assert!((residual[(left, 0)] - (z[left] - prediction.mean[(0, 0)])).abs() < 1e-9);
+            assert!((variance[left] - prediction.variance[0] - theta.noise_std.powi(2)).abs() < 1e-9);
+        }
+    }
+}

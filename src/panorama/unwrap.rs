@@ -1,0 +1,312 @@
+//! Camera image → panorama, by a table made once per calibration.
+
+use std::f64::consts::TAU;
+
+use super::{GRAY_SIZE, Panorama, SAMPLED_COLUMNS, SAMPLED_ROWS, WIDE_COLUMNS};
+use crate::types::{AzimuthSense, CalibrationError, DonutCalibration, LumaImage};
+
+/// Where in the camera image every sample of the panorama lies.
+///
+/// Sample (k, j) of the K × J = [`SAMPLED_ROWS`] × [`SAMPLED_COLUMNS`] panorama lies at
+///
+/// ```text
+/// φ = start ± 2π (j + ½) / J        + where columns run clockwise on the screen
+/// r = r_out − (r_out − r_in) (k + ½) / K      (row 0 is the outer rim; else r_in + …)
+/// (x, y) = (cx + r cos φ, cy + r sin φ)       pixel centres at integer coordinates
+/// ```
+///
+/// and is interpolated bilinearly. Where a sample spans more than [`MAX_SPACING_PX`] camera pixels, several sub-samples
+/// are averaged, so that no camera pixel is skipped: the reduction is an area average at every size of camera image.
+#[derive(Debug, Clone)]
+pub struct UnwrapTable {
+    image_width_px: usize,
+    image_height_px: usize,
+    azimuth: AzimuthSense,
+    /// Sub-samples a sample, in azimuth and in radius.
+    sub_columns: usize,
+    sub_rows: usize,
+    /// `K·sub_rows × J·sub_columns` samples, row-major.
+    samples: Vec<Sample>,
+}
+
+/// A bilinear sample: the top left of four neighbouring pixels and the weights of the right and the lower ones.
+#[derive(Debug, Clone, Copy)]
+struct Sample {
+    index: u32,
+    right: f32,
+    below: f32,
+}
+
+/// Bilinear samples further apart than this skip pixels \[px\].
+const MAX_SPACING_PX: f64 = 2.1;
+
+impl UnwrapTable {
+    /// The table for images of `width_px` × `height_px`.
+    ///
+    /// # Errors
+    /// When the donut does not lie in such an image.
+    pub fn build(donut: &DonutCalibration, width_px: usize, height_px: usize) -> Result<Self, CalibrationError> {
+        donut.check_in_image(width_px, height_px)?;
+        let span = |length_px: f64, samples: usize| (length_px / samples as f64 / MAX_SPACING_PX).ceil().max(1.0);
+        let sub_columns = span(TAU * donut.outer_radius_px, SAMPLED_COLUMNS) as usize;
+        let sub_rows = span(donut.outer_radius_px - donut.inner_radius_px, SAMPLED_ROWS) as usize;
+        let (columns, rows) = (SAMPLED_COLUMNS * sub_columns, SAMPLED_ROWS * sub_rows);
+
+        let directions: Vec<(f64, f64)> = (0..columns)
+            .map(|j| {
+                let turned_rad = TAU * (j as f64 + 0.5) / columns as f64;
+                let angle_rad = donut.start_angle_rad + if donut.clockwise { turned_rad } else { -turned_rad };
+                (angle_rad.cos(), angle_rad.sin())
+            })
+            .collect();
+        let mut samples = Vec::with_capacity(columns * rows);
+        for k in 0..rows {
+            let fraction = (k as f64 + 0.5) / rows as f64;
+            let inwards = if donut.top_is_outer { fraction } else { 1.0 - fraction };
+            let radius_px = donut.outer_radius_px - (donut.outer_radius_px - donut.inner_radius_px) * inwards;
+            samples.extend(directions.iter().map(|(cos, sin)| {
+                let x = donut.center_x_px + radius_px * cos;
+                let y = donut.center_y_px + radius_px * sin;
+                Sample::at(x, y, width_px, height_px)
+            }));
+        }
+        Ok(Self {
+            image_width_px: width_px,
+            image_height_px: height_px,
+            azimuth: donut.azimuth,
+            sub_columns,
+            sub_rows,
+            samples,
+        })
+    }
+
+    /// Width and height of the images that this table unwraps.
+    pub fn image_size_px(&self) -> (usize, usize) {
+        (self.image_width_px, self.image_height_px)
+    }
+
+    /// Unwraps `image`.
+    ///
+    /// # Panics
+    /// When the image is not of [`image_size_px`](Self::image_size_px).
+    pub fn to_panorama(&self, image: &LumaImage) -> Panorama {
+        let mut panorama = Panorama::zeros();
+        self.unwrap_into(image, 0, &mut panorama);
+        panorama
+    }
+
+    /// How many of the [`SAMPLED_COLUMNS`] the panorama of a vehicle at `yaw_rad` is to be shifted so that column 0
+    /// looks east, whatever the heading: the paper's “(fixed)” rows.
+    pub fn columns_to_east(&self, yaw_rad: f64) -> usize {
+        let turn = match self.azimuth {
+            AzimuthSense::Ccw => yaw_rad,
+            AzimuthSense::Cw => -yaw_rad,
+        };
+        (turn / TAU * SAMPLED_COLUMNS as f64).round().rem_euclid(SAMPLED_COLUMNS as f64) as usize % SAMPLED_COLUMNS
+    }
+
+    /// Unwraps `image` into `panorama`, column `j` going to column `j + shift_columns` of [`SAMPLED_COLUMNS`].
+    ///
+    /// # Panics
+    /// As [`to_panorama`](Self::to_panorama).
+    pub fn unwrap_into(&self, image: &LumaImage, shift_columns: usize, panorama: &mut Panorama) {
+        assert_eq!((image.width_px, image.height_px), self.image_size_px(), "the table is for another image size");
+        let shift = shift_columns % SAMPLED_COLUMNS;
+        let mut row = [0.0_f32; SAMPLED_COLUMNS];
+        let mut sampled = vec![0.0_f32; if self.sub_columns > 1 { SAMPLED_COLUMNS * self.sub_columns } else { 0 }];
+        let columns = SAMPLED_COLUMNS * self.sub_columns;
+        panorama.column_means.fill(0.0);
+        panorama.wide.fill(0.0);
+
+        for (k, samples) in self.samples.chunks_exact(columns).enumerate() {
+            if self.sub_columns == 1 {
+                sample_row(samples, &image.pixels, self.image_width_px, &mut row);
+            } else {
+                sample_row(samples, &image.pixels, self.image_width_px, &mut sampled);
+                for (mean, group) in row.iter_mut().zip(sampled.chunks_exact(self.sub_columns)) {
+                    *mean = group.iter().sum::<f32>() / self.sub_columns as f32;
+                }
+            }
+            row.rotate_right(shift);
+            let wide_row = k / self.sub_rows / 2;
+            add_row(&row, &mut panorama.column_means, &mut panorama.wide[wide_row * WIDE_COLUMNS..][..WIDE_COLUMNS]);
+        }
+        let rows = (SAMPLED_ROWS * self.sub_rows) as f32;
+        panorama.column_means.iter_mut().for_each(|mean| *mean /= rows);
+        let per_cell = (4 * self.sub_rows) as f32;
+        panorama.wide.iter_mut().for_each(|value| *value /= per_cell);
+
+        let per_gray = WIDE_COLUMNS / GRAY_SIZE;
+        for (gray, group) in panorama.gray.iter_mut().zip(panorama.wide.chunks_exact(per_gray)) {
+            *gray = group.iter().sum::<f32>() / per_gray as f32;
+        }
+    }
+}
+
+impl Sample {
+    /// The sample at (`x`, `y`) \[px\]; border pixels are repeated outside the image.
+    fn at(x: f64, y: f64, width_px: usize, height_px: usize) -> Self {
+        let x = x.clamp(0.0, width_px as f64 - 1.0);
+        let y = y.clamp(0.0, height_px as f64 - 1.0);
+        let left = (x.floor() as usize).min(width_px - 2);
+        let top = (y.floor() as usize).min(height_px - 2);
+        Self { index: (top * width_px + left) as u32, right: (x - left as f64) as f32, below: (y - top as f64) as f32 }
+    }
+}
+
+/// Interpolates `samples` in `pixels`, whose rows are `width_px` long.
+fn sample_row<P: Copy + Into<f32>>(samples: &[Sample], pixels: &[P], width_px: usize, values: &mut [f32]) {
+    for (value, sample) in values.iter_mut().zip(samples) {
+        let index = sample.index as usize;
+        let upper = &pixels[index..index + width_px + 2];
+        let [p00, p01]: [f32; 2] = [upper[0].into(), upper[1].into()];
+        let [p10, p11]: [f32; 2] = [upper[width_px].into(), upper[width_px + 1].into()];
+        let top = p00 + sample.right * (p01 - p00);
+        let bottom = p10 + sample.right * (p11 - p10);
+        *value = top + sample.below * (bottom - top);
+    }
+}
+
+/// Adds one sampled row to the sums over columns and, in pairs, to a row of the wide panorama.
+fn add_row(row: &[f32; SAMPLED_COLUMNS], column_sums: &mut [f32], wide: &mut [f32]) {
+    for (sum, value) in column_sums.iter_mut().zip(row) {
+        *sum += value;
+    }
+    for (sum, pair) in wide.iter_mut().zip(row.chunks_exact(2)) {
+        *sum += pair[0] + pair[1];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::types::LensKind;
+
+    fn donut() -> DonutCalibration {
+        DonutCalibration {
+            kind: LensKind::Donut,
+            center_x_px: 99.5,
+            center_y_px: 88.25,
+            inner_radius_px: 20.0,
+            outer_radius_px: 80.0,
+            top_is_outer: true,
+            start_angle_rad: 0.0,
+            clockwise: true,
+            azimuth: AzimuthSense::Ccw,
+        }
+    }
+
+    /// A donut image that encodes direction: brightness grows with cos of the angle.
+    fn lighthouse(bright_rad: f64) -> LumaImage {
+        LumaImage::from_fn(200, 180, |x, y| {
+            let angle_rad = (y as f64 - 88.25).atan2(x as f64 - 99.5);
+            (127.5 + 100.0 * (angle_rad - bright_rad).cos()) as u8
+        })
+    }
+
+    fn brightest_column(panorama: &Panorama) -> usize {
+        (0..SAMPLED_COLUMNS)
+            .max_by(|&a, &b| panorama.column_means[a].total_cmp(&panorama.column_means[b]))
+            .expect("there are columns")
+    }
+
+    #[test]
+    fn columns_follow_the_start_angle_and_the_direction() {
+        for (start_angle_rad, clockwise, bright_rad, column) in
+            [(0.0, true, 1.0, 163), (0.0, false, 1.0, 861), (1.0, true, 1.5, 81), (1.0, false, 0.5, 81)]
+        {
+            let table = UnwrapTable::build(&DonutCalibration { start_angle_rad, clockwise, ..donut() }, 200, 180)
+                .expect("the donut is inside");
+            let found = brightest_column(&table.to_panorama(&lighthouse(bright_rad)));
+            assert!(found.abs_diff(column) < 20, "{found} instead of {column}");
+        }
+    }
+
+    #[test]
+    fn row_zero_is_the_named_rim() {
+        let rings = LumaImage::from_fn(200, 180, |x, y| {
+            if (x as f64 - 99.5).hypot(y as f64 - 88.25) > 50.0 { 200 } else { 50 }
+        });
+        for (top_is_outer, first, last) in [(true, 200.0, 50.0), (false, 50.0, 200.0)] {
+            let table = UnwrapTable::build(&DonutCalibration { top_is_outer, ..donut() }, 200, 180).expect("inside");
+            let panorama = table.to_panorama(&rings);
+            assert_eq!((panorama.gray[0], panorama.gray[GRAY_SIZE * GRAY_SIZE - 1]), (first, last));
+        }
+    }
+
+    #[test]
+    fn all_sizes_have_the_same_mean() {
+        let table = UnwrapTable::build(&donut(), 200, 180).expect("inside");
+        let panorama = table.to_panorama(&lighthouse(0.3));
+        let mean = |values: &[f32]| values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len() as f64;
+        assert!((mean(&panorama.gray) - mean(&panorama.wide)).abs() < 1e-4);
+        assert!((mean(&panorama.gray) - mean(&panorama.column_means)).abs() < 1e-4);
+    }
+
+    #[test]
+    fn no_camera_pixel_is_skipped_in_a_large_image() {
+        // One bright pixel in a large donut must be seen with its share of the area, wherever it lies.
+        let large = DonutCalibration {
+            center_x_px: 1500.0,
+            center_y_px: 1500.0,
+            inner_radius_px: 300.0,
+            outer_radius_px: 1450.0,
+            ..donut()
+        };
+        let table = UnwrapTable::build(&large, 3000, 3000).expect("inside");
+        for (x, y) in [(2900, 1503), (1507, 213), (700, 811), (1901, 1777)] {
+            let mut image = LumaImage::from_fn(3000, 3000, |_, _| 0);
+            image.pixels[y * 3000 + x] = 255;
+            let sum: f32 = table.to_panorama(&image).wide.iter().sum();
+            let radius_px = (x as f32 - 1500.0).hypot(y as f32 - 1500.0);
+            // Wide cells a camera pixel covers at this radius.
+            let cells = (512.0 / (std::f32::consts::TAU * radius_px)) * (128.0 / 1150.0);
+            assert!((sum / (255.0 * cells) - 1.0).abs() < 0.75, "({x}, {y}): {sum} {}", 255.0 * cells);
+        }
+    }
+
+    #[test]
+    fn turning_the_vehicle_shifts_the_columns_and_columns_to_east_undoes_it() {
+        let table = UnwrapTable::build(&donut(), 200, 180).expect("inside");
+        // A light in the east seen by a vehicle at some yaw: azimuth = yaw + column angle (ccw).
+        let mut panorama = Panorama::zeros();
+        for yaw_rad in [0.0, 0.7, -2.0, 3.1] {
+            table.unwrap_into(&lighthouse(-yaw_rad), table.columns_to_east(yaw_rad), &mut panorama);
+            let column = brightest_column(&panorama);
+            assert!(column.min(SAMPLED_COLUMNS - column) < 20, "yaw {yaw_rad}: east at column {column}");
+        }
+    }
+
+    /// `golden.json`, key `unwrap`: values of an independent implementation.
+    #[test]
+    fn sampling_equals_the_reference_values() {
+        let golden: serde_json::Value =
+            serde_json::from_str(include_str!("../../tests/data/golden.json")).expect("golden.json parses");
+        let pixels: Vec<f32> = (0..180)
+            .flat_map(|y| (0..200).map(move |x| (f64::from(x), f64::from(y))))
+            .map(|(x, y)| (0.5 * x + 0.25 * y + 20.0 * (x / 11.0).sin() * (y / 7.0).cos()) as f32)
+            .collect();
+        let (columns, rows) = (64, 16);
+        let mut values = vec![0.0; columns * rows];
+        for k in 0..rows {
+            let radius_px = 80.0 - 60.0 * (k as f64 + 0.5) / rows as f64;
+            let samples: Vec<Sample> = (0..columns)
+                .map(|j| {
+                    let angle_rad = TAU * (j as f64 + 0.5) / columns as f64;
+                    Sample::at(99.5 + radius_px * angle_rad.cos(), 88.25 + radius_px * angle_rad.sin(), 200, 180)
+                })
+                .collect();
+            sample_row(&samples, &pixels, 200, &mut values[k * columns..(k + 1) * columns]);
+        }
+        for (key, row) in [("row0_first8", 0), ("row15_first8", 15)] {
+            for (j, expected) in golden["unwrap"][key].as_array().expect("a list").iter().enumerate() {
+                let expected = expected.as_f64().expect("a number");
+                let found = f64::from(values[row * columns + j]);
+                assert!((found / expected - 1.0).abs() < 1e-6, "{key}[{j}]: {found} instead of {expected}");
+            }
+        }
+        let sum: f64 = values.iter().map(|&v| f64::from(v)).sum();
+        let expected = golden["unwrap"]["sum"].as_f64().expect("a number");
+        assert!((sum / expected - 1.0).abs() < 1e-6, "{sum} instead of {expected}");
+    }
+}
