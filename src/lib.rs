@@ -1,9 +1,13 @@
 //! omniloc tells a vehicle where it is from one omnidirectional camera.
 
+pub mod evaluate;
 pub mod features;
 #[cfg(test)]
 mod golden;
 pub mod gp;
 pub mod jpeg;
+pub mod localize;
+pub mod map;
 pub mod panorama;
+pub mod train;
 pub mod types;

@@ -5,6 +5,7 @@
 
 mod fft;
 mod histogram;
+pub mod scaling;
 mod steerable;
 
 

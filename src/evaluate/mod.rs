@@ -1,0 +1,5 @@
+//! Figures.
+
+mod metrics;
+
+pub use metrics::ErrorFigures;

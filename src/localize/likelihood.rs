@@ -1,0 +1,210 @@
+//! Log-likelihood of a frame's features at every candidate cell.
+
+use std::f64::consts::TAU;
+
+use multiversion::multiversion;
+use serde::{Deserialize, Serialize};
+
+/// How the residuals of a group of features add up to a log-likelihood. With r_i = (z_i − μ_i)² / p_i, where
+/// p_i = σ_e² + v_i is the predictive variance:
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NoiseModel {
+    /// −½ Σ (r_i + log p_i + log 2π): Do et al. (2015), eqs. 10 and 11.
+    Gaussian,
+    /// −k/2 log Σ r_i − ½ Σ log p_i: one unknown factor on all the variances of a frame, at its most likely value. Light
+    /// and traffic change a frame's residuals together; a frame that fits nowhere well is not trusted k times over.
+    UnknownScale,
+}
+
+/// A group's Gaussian processes on the candidate cells.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FieldOnCells {
+    features: usize,
+    cells: usize,
+    /// Posterior mean, feature × cell.
+    mean: Vec<f32>,
+    /// 1 / p: feature × cell, or one row where all features share it.
+    precision: Vec<f32>,
+    /// −½ Σ (log p + log 2π) over the features, a cell.
+    log_normalizer: Vec<f32>,
+}
+
+impl FieldOnCells {
+    /// From posterior means (feature × cell) and predictive variances, noise included (feature × cell, or one row shared
+    /// by all features).
+    ///
+    /// # Panics
+    /// When the sizes do not belong together.
+    pub fn new(features: usize, cells: usize, mean: Vec<f32>, variance: &[f32]) -> Self {
+        assert_eq!(mean.len(), features * cells, "one mean a feature and cell");
+        assert!(variance.len() == cells || variance.len() == features * cells, "variances shared, or one a feature");
+        let share = if variance.len() == cells { features as f64 } else { 1.0 };
+        let mut log_normalizer = vec![0.0_f64; cells];
+        for row in variance.chunks_exact(cells.max(1)) {
+            for (log_normalizer, &p) in log_normalizer.iter_mut().zip(row) {
+                *log_normalizer -= 0.5 * share * (f64::from(p) * TAU).ln();
+            }
+        }
+        Self {
+            features,
+            cells,
+            mean,
+            precision: variance.iter().map(|p| 1.0 / p).collect(),
+            log_normalizer: log_normalizer.into_iter().map(|value| value as f32).collect(),
+        }
+    }
+
+    pub fn features(&self) -> usize {
+        self.features
+    }
+
+    pub fn cells(&self) -> usize {
+        self.cells
+    }
+
+    fn precision_of(&self, feature: usize) -> &[f32] {
+        let row = if self.precision.len() == self.cells { 0 } else { feature };
+        &self.precision[row * self.cells..(row + 1) * self.cells]
+    }
+
+    fn mean_of(&self, feature: usize) -> &[f32] {
+        &self.mean[feature * self.cells..(feature + 1) * self.cells]
+    }
+
+    /// Adds `weight` × the log-likelihood of `features` at every cell to `log_likelihood`. `scratch` is overwritten.
+    ///
+    /// # Panics
+    /// When `features` or `log_likelihood` is of another length than the field.
+    pub fn add_log_likelihood(
+        &self,
+        features: &[f32],
+        noise: NoiseModel,
+        weight: f32,
+        scratch: &mut Vec<f32>,
+        log_likelihood: &mut [f32],
+    ) {
+        assert_eq!((features.len(), log_likelihood.len()), (self.features, self.cells), "features and cells");
+        scratch.clear();
+        scratch.resize(self.cells, 0.0);
+        if self.precision.len() == self.cells {
+            for (feature, &z) in features.iter().enumerate() {
+                add_squared_distance(z, self.mean_of(feature), scratch);
+            }
+            scratch.iter_mut().zip(&self.precision).for_each(|(residual, precision)| *residual *= precision);
+        } else {
+            for (feature, &z) in features.iter().enumerate() {
+                add_residual(z, self.mean_of(feature), self.precision_of(feature), scratch);
+            }
+        }
+        let count = self.features as f32;
+        for ((out, residual), normalizer) in log_likelihood.iter_mut().zip(&*scratch).zip(&self.log_normalizer) {
+            let fit = match noise {
+                NoiseModel::Gaussian => *residual,
+                NoiseModel::UnknownScale => count * residual.max(f32::MIN_POSITIVE).ln(),
+            };
+            *out += weight * (normalizer - 0.5 * fit);
+        }
+    }
+
+    /// Eq. 10 of every feature on its own, feature × cell.
+    pub fn log_likelihood_of_each(&self, features: &[f32]) -> Vec<f32> {
+        let mut table = Vec::with_capacity(self.features * self.cells);
+        for (feature, &z) in features.iter().enumerate() {
+            let cells = self.mean_of(feature).iter().zip(self.precision_of(feature));
+            table.extend(cells.map(|(&mean, &precision)| {
+                let residual = (z - mean).powi(2) * precision;
+                -0.5 * (residual - precision.ln() + TAU.ln() as f32)
+            }));
+        }
+        table
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn add_residual(z: f32, mean: &[f32], precision: &[f32], sum: &mut [f32]) {
+    for ((sum, mean), precision) in sum.iter_mut().zip(mean).zip(precision) {
+        let difference = z - mean;
+        *sum += difference * difference * precision;
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn add_squared_distance(z: f32, mean: &[f32], sum: &mut [f32]) {
+    for (sum, mean) in sum.iter_mut().zip(mean) {
+        let difference = z - mean;
+        *sum += difference * difference;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::golden::{golden, list};
+
+    fn field() -> FieldOnCells {
+        let mean = vec![0.0, 1.0, 2.0, -1.0, 0.5, 0.25];
+        FieldOnCells::new(2, 3, mean, &[0.5, 1.0, 2.0, 0.1, 0.2, 0.4])
+    }
+
+    /// Eq. 10 at `golden.json`'s prediction, for z = 0.3.
+    #[test]
+    fn log_likelihood_equals_the_reference_values() {
+        let gp = &golden()["gp"];
+        let noise_variance = list(&gp["theta_log_sf_se_l1_l2"])[1].exp().powi(2);
+        let mean = list(&gp["mean"]).iter().map(|&mean| mean as f32).collect();
+        let variance: Vec<f32> = list(&gp["var"]).iter().map(|&v| (v + noise_variance) as f32).collect();
+        let field = FieldOnCells::new(1, 3, mean, &variance);
+        for (found, expected) in field.log_likelihood_of_each(&[0.3]).iter().zip(list(&gp["loglik_eq10_z0_3"])) {
+            assert!((f64::from(*found) / expected - 1.0).abs() < 1e-6, "{found} instead of {expected}");
+        }
+    }
+
+    #[test]
+    fn the_sum_equals_the_sum_of_each() {
+        let (features, mut sum, mut scratch) = ([0.3, -0.7], vec![0.0; 3], Vec::new());
+        field().add_log_likelihood(&features, NoiseModel::Gaussian, 1.0, &mut scratch, &mut sum);
+        let each = field().log_likelihood_of_each(&features);
+        for (cell, sum) in sum.iter().enumerate() {
+            assert!((sum - each[cell] - each[3 + cell]).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn shared_variances_equal_repeated_ones() {
+        let mean = vec![0.0, 1.0, 2.0, -1.0, 0.5, 0.25];
+        let shared = FieldOnCells::new(2, 3, mean.clone(), &[0.5, 1.0, 2.0]);
+        let repeated = FieldOnCells::new(2, 3, mean, &[0.5, 1.0, 2.0, 0.5, 1.0, 2.0]);
+        for noise in [NoiseModel::Gaussian, NoiseModel::UnknownScale] {
+            let (mut a, mut b, mut scratch) = (vec![0.0; 3], vec![0.0; 3], Vec::new());
+            shared.add_log_likelihood(&[0.3, -0.7], noise, 0.5, &mut scratch, &mut a);
+            repeated.add_log_likelihood(&[0.3, -0.7], noise, 0.5, &mut scratch, &mut b);
+            for (a, b) in a.iter().zip(&b) {
+                assert!((a - b).abs() < 1e-6);
+            }
+        }
+    }
+
+    /// The unknown scale is the Gaussian likelihood at its best factor on the variances, up to a constant.
+    #[test]
+    fn unknown_scale_is_the_profile_of_the_gaussian() {
+        let features = [0.3_f32, -0.7];
+        let (mut profile, mut scratch) = (vec![0.0; 3], Vec::new());
+        field().add_log_likelihood(&features, NoiseModel::UnknownScale, 1.0, &mut scratch, &mut profile);
+        let best = |cell: usize| {
+            let factors = (1..4000).map(|i| 0.005 * i as f32);
+            factors
+                .map(|factor| {
+                    let variance: Vec<f32> = [0.5, 1.0, 2.0, 0.1, 0.2, 0.4].map(|p: f32| p * factor).to_vec();
+                    let scaled = FieldOnCells::new(2, 3, vec![0.0, 1.0, 2.0, -1.0, 0.5, 0.25], &variance);
+                    let each = scaled.log_likelihood_of_each(&features);
+                    each[cell] + each[3 + cell]
+                })
+                .fold(f32::NEG_INFINITY, f32::max)
+        };
+        let constant = profile[0] - best(0);
+        for (cell, profile) in profile.iter().enumerate() {
+            assert!((profile - best(cell) - constant).abs() < 1e-3, "{cell}");
+        }
+    }
+}

@@ -1,0 +1,144 @@
+//! Candidate cells: where the vehicle may be.
+
+use serde::{Deserialize, Serialize};
+
+use crate::types::{PositionM, distance_m};
+
+/// Cells of a regular grid. Cell (i, j) has its centre at `origin + step · (i, j)`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CandidateCells {
+    pub grid: Grid,
+    /// Cells that are candidates, by row (north), then column.
+    cells: Vec<[u32; 2]>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Grid {
+    pub origin_m: PositionM,
+    pub step_m: f64,
+    pub columns: u32,
+    pub rows: u32,
+}
+
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum CellsError {
+    #[error("grid step {step_m} m: expected a positive number")]
+    BadStep { step_m: f64 },
+    #[error("{cells:.0} candidate cells at a grid step of {step_m} m are more than {MAX_CELLS}; use a larger --grid-step-m")]
+    TooMany { cells: f64, step_m: f64 },
+}
+
+/// More cells than this are a mistake in the step or the positions.
+const MAX_CELLS: u32 = 4_000_000;
+
+impl CandidateCells {
+    /// The grid over the bounding box of `positions`; with `within_m`, only cells at most that far from one of them.
+    ///
+    /// # Errors
+    /// When the step is not positive, or so small that the grid would not fit.
+    pub fn around(positions: &[PositionM], step_m: f64, within_m: Option<f64>) -> Result<Self, CellsError> {
+        if !(step_m.is_finite() && step_m > 0.0) {
+            return Err(CellsError::BadStep { step_m });
+        }
+        let bound = |axis: usize, pick: fn(f64, f64) -> f64| positions.iter().map(|p| p[axis]).reduce(pick).unwrap_or(0.0);
+        let origin_m = [bound(0, f64::min), bound(1, f64::min)];
+        // A position on the far border keeps its cell however the division rounds.
+        let count = |axis: usize| ((bound(axis, f64::max) - origin_m[axis]) / step_m - 1e-9).ceil().max(0.0) + 1.0;
+        let (columns, rows) = (count(0), count(1));
+        if columns * rows > f64::from(MAX_CELLS) {
+            return Err(CellsError::TooMany { cells: columns * rows, step_m });
+        }
+        let grid = Grid { origin_m, step_m, columns: columns as u32, rows: rows as u32 };
+        let all = (0..grid.rows).flat_map(|j| (0..grid.columns).map(move |i| [i, j]));
+        let near = |cell: &[u32; 2]| {
+            let center = grid.center_m(*cell);
+            within_m.is_none_or(|within_m| positions.iter().any(|&p| distance_m(p, center) <= within_m))
+        };
+        Ok(Self { grid, cells: all.filter(near).collect() })
+    }
+
+    /// Cells read from a file.
+    ///
+    /// # Errors
+    /// Says which cell lies outside the grid or out of order.
+    pub fn from_parts(grid: Grid, cells: Vec<[u32; 2]>) -> Result<Self, String> {
+        let ordered = cells.windows(2).all(|pair| (pair[0][1], pair[0][0]) < (pair[1][1], pair[1][0]));
+        if let Some(cell) = cells.iter().find(|cell| cell[0] >= grid.columns || cell[1] >= grid.rows) {
+            return Err(format!("cell {cell:?} outside the grid of {} x {}", grid.columns, grid.rows));
+        }
+        if !ordered || cells.is_empty() {
+            return Err("the cells are not in order".into());
+        }
+        if !(grid.step_m.is_finite() && grid.step_m > 0.0 && grid.origin_m.iter().all(|o| o.is_finite())) {
+            return Err(format!("impossible grid {grid:?}"));
+        }
+        Ok(Self { grid, cells })
+    }
+
+    pub fn len(&self) -> usize {
+        self.cells.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.cells.is_empty()
+    }
+
+    pub fn indices(&self) -> &[[u32; 2]] {
+        &self.cells
+    }
+
+    /// Centres of all cells, in order \[m\].
+    pub fn centers_m(&self) -> Vec<PositionM> {
+        self.cells.iter().map(|&cell| self.grid.center_m(cell)).collect()
+    }
+
+    pub fn center_m(&self, index: usize) -> PositionM {
+        self.grid.center_m(self.cells[index])
+    }
+
+    /// The candidate at column `i`, row `j` of the grid, if it is one.
+    pub fn index_of(&self, [i, j]: [u32; 2]) -> Option<usize> {
+        self.cells.binary_search_by_key(&(j, i), |cell| (cell[1], cell[0])).ok()
+    }
+}
+
+impl Grid {
+    fn center_m(&self, [i, j]: [u32; 2]) -> PositionM {
+        [self.origin_m[0] + self.step_m * f64::from(i), self.origin_m[1] + self.step_m * f64::from(j)]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_grid_covers_the_bounding_box() {
+        let positions = [[1.0, 2.0], [4.2, 2.5], [2.0, 3.0]];
+        let cells = CandidateCells::around(&positions, 0.5, None).expect("a small grid");
+        assert_eq!((cells.grid.columns, cells.grid.rows, cells.len()), (8, 3, 24));
+        assert_eq!(cells.center_m(0), [1.0, 2.0]);
+        assert_eq!(cells.center_m(23), [4.5, 3.0]);
+        for (index, &cell) in cells.indices().iter().enumerate() {
+            assert_eq!(cells.index_of(cell), Some(index));
+        }
+    }
+
+    #[test]
+    fn far_cells_are_left_out() {
+        let cells = CandidateCells::around(&[[0.0, 0.0], [10.0, 10.0]], 1.0, Some(1.5)).expect("a small grid");
+        assert_eq!(cells.len(), 2 * 4);
+        assert_eq!(cells.index_of([5, 5]), None);
+        assert_eq!(cells.index_of([1, 1]).map(|index| cells.center_m(index)), Some([1.0, 1.0]));
+    }
+
+    #[test]
+    fn impossible_steps_are_refused() {
+        for step_m in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            assert!(matches!(CandidateCells::around(&[[0.0, 0.0]], step_m, None), Err(CellsError::BadStep { .. })));
+        }
+        let error = CandidateCells::around(&[[0.0, 0.0], [1e6, 1e6]], 0.1, None).expect_err("too many");
+        assert!(error.to_string().contains("--grid-step-m"), "{error}");
+    }
+}

@@ -1,0 +1,5 @@
+//! The map.
+
+mod cells;
+
+pub use cells::{CandidateCells, CellsError, Grid};

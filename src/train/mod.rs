@@ -1,0 +1,7 @@
+//! Offline.
+
+mod split;
+mod subset;
+
+pub use split::{Split, SplitError, SplitKind};
+pub use subset::{Elimination, LikelihoodTable, backward_elimination, component_median};
