@@ -4,6 +4,7 @@
 //! (whitening or z-score).
 
 mod fft;
+mod gradient;
 mod histogram;
 pub mod scaling;
 mod steerable;
@@ -15,6 +16,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::panorama::Panorama;
+use gradient::GradientSignature;
 use steerable::{Response, SteerablePyramid};
 
 /// A kind of image properties.
@@ -33,10 +35,23 @@ pub enum Descriptor {
     SpLog,
     /// Local energy of the steerable pyramid.
     SpEnergy,
+    /// Fourier signature of gradient orientations.
+    Gradient,
+    /// The same at half the resolution.
+    GradientCoarse,
 }
 
 impl Descriptor {
-    pub const ALL: [Self; 6] = [Self::Fft, Self::Hist, Self::HistSqrt, Self::Sp, Self::SpLog, Self::SpEnergy];
+    pub const ALL: [Self; 8] = [
+        Self::Fft,
+        Self::Hist,
+        Self::HistSqrt,
+        Self::Sp,
+        Self::SpLog,
+        Self::SpEnergy,
+        Self::Gradient,
+        Self::GradientCoarse,
+    ];
     /// The three the paper evaluates.
     pub const PAPER: [Self; 3] = [Self::Fft, Self::Hist, Self::Sp];
 
@@ -46,6 +61,8 @@ impl Descriptor {
             Self::Fft => fft::DIMENSIONS,
             Self::Hist | Self::HistSqrt => histogram::DIMENSIONS,
             Self::Sp | Self::SpLog | Self::SpEnergy => steerable::DIMENSIONS,
+            Self::Gradient => gradient::FINE.dimensions(),
+            Self::GradientCoarse => gradient::COARSE.dimensions(),
         }
     }
 
@@ -58,6 +75,8 @@ impl Descriptor {
             Self::Sp => "sp",
             Self::SpLog => "sp-log",
             Self::SpEnergy => "sp-energy",
+            Self::Gradient => "gradient",
+            Self::GradientCoarse => "gradient-coarse",
         }
     }
 }
@@ -98,15 +117,27 @@ impl From<Descriptor> for String {
 }
 
 /// Computes descriptors, with the plans and buffers they need: nothing is allocated per frame.
-#[derive(Default)]
 pub struct Describer {
     fft: fft::FftDescriptor,
     pyramid: SteerablePyramid<f32>,
+    gradient: GradientSignature,
+    gradient_coarse: GradientSignature,
+}
+
+impl Default for Describer {
+    fn default() -> Self {
+        Self::new()
+    }
 }
 
 impl Describer {
     pub fn new() -> Self {
-        Self::default()
+        Self {
+            fft: fft::FftDescriptor::new(),
+            pyramid: SteerablePyramid::new(),
+            gradient: GradientSignature::new(gradient::FINE),
+            gradient_coarse: GradientSignature::new(gradient::COARSE),
+        }
     }
 
     /// Fills `properties` with the `descriptor` of `panorama`.
@@ -122,6 +153,8 @@ impl Describer {
             Descriptor::Sp => self.pyramid.describe(panorama, Response::Magnitude, properties),
             Descriptor::SpLog => self.pyramid.describe(panorama, Response::LogMagnitude, properties),
             Descriptor::SpEnergy => self.pyramid.describe(panorama, Response::Energy, properties),
+            Descriptor::Gradient => self.gradient.describe(panorama, properties),
+            Descriptor::GradientCoarse => self.gradient_coarse.describe(panorama, properties),
         }
     }
 }

@@ -282,18 +282,14 @@ fn starts(learning: &LearningPositions, features: MatRef<f64>, bounds: &Bounds) 
 fn profile(learning: &LearningPositions, features: &Mat<f64>, length_scale_m: [f64; 2]) -> Vec<(f64, Hyperparameters)> {
     let n = learning.len();
     let unit = Hyperparameters { signal_std: 1.0, noise_std: 0.0, length_scale_m };
-    let correlation = learning.kernel_matrix(&unit);
-    let Ok(eigen) = correlation.self_adjoint_eigen(Side::Lower) else {
-        return vec![(f64::NEG_INFINITY, Hyperparameters { noise_std: 1.0, ..unit }); features.ncols()];
-    };
-    let eigenvalues: Vec<f64> = eigen.S().column_vector().iter().map(|&value| value.max(0.0)).collect();
-    let mut projected = eigen.U().transpose() * features;
+    let eigen = learning.correlation_eigen(&unit);
+    let mut projected = eigen.vectors.transpose() * features;
     for j in 0..projected.ncols() {
         projected.col_mut(j).iter_mut().for_each(|w| *w *= *w);
     }
-    let reciprocal = Mat::from_fn(START_NOISE_RATIOS.len(), n, |r, i| 1.0 / (eigenvalues[i] + START_NOISE_RATIOS[r]));
+    let reciprocal = Mat::from_fn(START_NOISE_RATIOS.len(), n, |r, i| 1.0 / (eigen.values[i] + START_NOISE_RATIOS[r]));
     let log_determinant =
-        START_NOISE_RATIOS.map(|ratio| eigenvalues.iter().map(|value| (value + ratio).ln()).sum::<f64>());
+        START_NOISE_RATIOS.map(|ratio| eigen.values.iter().map(|value| (value + ratio).ln()).sum::<f64>());
     let signal_variance = &reciprocal * &projected;
     (0..features.ncols())
         .map(|feature| {

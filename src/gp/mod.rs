@@ -66,6 +66,19 @@ impl LearningPositions {
         k
     }
 
+    /// K = Q Λ Qᵀ at `hyperparameters`, without noise.
+    pub fn correlation_eigen(&self, hyperparameters: &Hyperparameters) -> KernelEigen {
+        let n = self.len();
+        match self.kernel_matrix(hyperparameters).self_adjoint_eigen(Side::Lower) {
+            Ok(eigen) => KernelEigen {
+                values: eigen.S().column_vector().iter().map(|&value| value.max(0.0)).collect(),
+                vectors: eigen.U().to_owned(),
+            },
+            // Only for entries that are no numbers, which positions from a file never are; then every direction is null.
+            Err(_) => KernelEigen { values: vec![0.0; n], vectors: Mat::identity(n, n) },
+        }
+    }
+
     /// The Cholesky factor of R = K + σ_e² I.
     fn factorize(&self, hyperparameters: &Hyperparameters) -> Result<Llt<f64>, GpError> {
         let mut r = self.kernel_matrix(hyperparameters);
@@ -76,6 +89,13 @@ impl LearningPositions {
         r.llt(Side::Lower)
             .map_err(|_| GpError::NotPositiveDefinite { points: self.len(), hyperparameters: *hyperparameters })
     }
+}
+
+/// Eigendecomposition of a kernel matrix; values in rising order, none negative.
+pub struct KernelEigen {
+    pub values: Vec<f64>,
+    /// Q, n × n, one vector a column.
+    pub vectors: Mat<f64>,
 }
 
 /// What is known of one or more fields with the same hyperparameters after n observations of each.

@@ -39,6 +39,30 @@ impl Panorama {
         }
     }
 
+    /// The panorama with this `wide` image; the column means then have the resolution of `wide`.
+    ///
+    /// # Panics
+    /// When `wide` is not [`WIDE_ROWS`] × [`WIDE_COLUMNS`].
+    pub fn from_wide(wide: Vec<f32>) -> Self {
+        assert_eq!(wide.len(), WIDE_ROWS * WIDE_COLUMNS, "one value a pixel");
+        let mut panorama = Self { wide, ..Self::zeros() };
+        panorama.reduce_to_gray();
+        for row in panorama.wide.chunks_exact(WIDE_COLUMNS) {
+            for (pair, value) in panorama.column_means.chunks_exact_mut(SAMPLED_COLUMNS / WIDE_COLUMNS).zip(row) {
+                pair.iter_mut().for_each(|mean| *mean += value / WIDE_ROWS as f32);
+            }
+        }
+        panorama
+    }
+
+    /// `gray` from `wide`, which has as many rows.
+    fn reduce_to_gray(&mut self) {
+        let per_gray = WIDE_COLUMNS / GRAY_SIZE;
+        for (gray, group) in self.gray.iter_mut().zip(self.wide.chunks_exact(per_gray)) {
+            *gray = group.iter().sum::<f32>() / per_gray as f32;
+        }
+    }
+
     /// The panorama as if the camera had been turned: column `j` moves to column `j + columns` of
     /// [`SAMPLED_COLUMNS`], which must be a multiple of what one column of `gray` spans (8).
     #[cfg(test)]

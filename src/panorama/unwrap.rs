@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use super::{GRAY_SIZE, Panorama, SAMPLED_COLUMNS, SAMPLED_ROWS, WIDE_COLUMNS};
+use super::{Panorama, SAMPLED_COLUMNS, SAMPLED_ROWS, WIDE_COLUMNS};
 use crate::types::{AzimuthSense, CalibrationError, DonutCalibration, LumaImage};
 
 /// Where in the camera image every sample of the panorama lies.
@@ -136,10 +136,7 @@ impl UnwrapTable {
         let per_cell = (4 * self.sub_rows) as f32;
         panorama.wide.iter_mut().for_each(|value| *value /= per_cell);
 
-        let per_gray = WIDE_COLUMNS / GRAY_SIZE;
-        for (gray, group) in panorama.gray.iter_mut().zip(panorama.wide.chunks_exact(per_gray)) {
-            *gray = group.iter().sum::<f32>() / per_gray as f32;
-        }
+        panorama.reduce_to_gray();
     }
 }
 
@@ -179,6 +176,7 @@ fn add_row(row: &[f32; SAMPLED_COLUMNS], column_sums: &mut [f32], wide: &mut [f3
 
 #[cfg(test)]
 mod tests {
+    use super::super::GRAY_SIZE;
     use super::*;
     use crate::types::LensKind;
 

@@ -1,5 +1,7 @@
 //! Offline.
 
+pub mod noise_whitening;
+pub mod perturbation;
 mod split;
 mod subset;
 

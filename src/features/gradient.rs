@@ -1,0 +1,320 @@
+//! Fourier signature of gradient orientations: `gradient` and `gradient-coarse`.
+
+use std::f32::consts::TAU;
+use std::sync::Arc;
+
+use realfft::num_complex::Complex;
+use realfft::{RealFftPlanner, RealToComplex};
+
+use crate::panorama::{Panorama, WIDE_COLUMNS, WIDE_ROWS};
+
+/// Orientation bins over the full circle: a dark-to-bright edge is not a bright-to-dark one.
+const BINS: usize = 8;
+/// Azimuthal harmonics kept, from 0.
+const HARMONICS: usize = 5;
+
+/// Sizes of one signature; pixels are those of its own reduced panorama.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sizes {
+    /// The wide panorama is reduced by this factor on both axes.
+    reduction: usize,
+    /// Elevation bands.
+    bands: usize,
+    /// Deviation of the Gaussian blur before the gradient.
+    blur_px: f32,
+    /// Deviation of the neighbourhood whose mean gradient divides the gradient.
+    contrast_px: f32,
+}
+
+/// 256 × 64 pixels in 32 bands.
+pub const FINE: Sizes = Sizes { reduction: 2, bands: 32, blur_px: 1.0, contrast_px: 8.0 };
+/// 128 × 32 pixels in 16 bands.
+pub const COARSE: Sizes = Sizes { reduction: 4, bands: 16, blur_px: 1.0, contrast_px: 4.0 };
+
+/// Gray values are counted from this, so that the logarithm of a dark, noisy pixel stays calm.
+const DARK_LEVEL: f32 = 16.0;
+/// Mean log-gradient a pixel that counts as no contrast at all: flat parts are not amplified to noise.
+const CONTRAST_FLOOR: f32 = 0.05;
+
+/// Magnitudes of the azimuthal Fourier transform of gradient orientations, band by band.
+///
+/// The Fourier signature of panorama rows (Menegatti, Maeda & Ishiguro 2004) taken of oriented gradients (Dalal & Triggs
+/// 2005) in place of gray values. With L = log(gray + 16), blurred, ∇L its gradient by central differences, θ its
+/// direction and ḡ the local mean of |∇L|,
+///
+/// ```text
+/// w = |∇L| / (ḡ + 0.05)                          local contrast: illumination cancels
+/// h_b(e, a) = mean over band e of w at azimuth a, shared linearly between the two bins b next to θ
+/// y_(b,e,k) = √ |Σ_a h_b(e, a) exp(−2πi k a / W)| / W          k = 0 … 4, divided by the norm of the whole vector
+/// ```
+///
+/// A turn of the vehicle shifts the azimuth and leaves the magnitudes as they are. Columns wrap round; rows are repeated
+/// at the rims.
+pub struct GradientSignature {
+    sizes: Sizes,
+    columns: usize,
+    rows: usize,
+    blur: Vec<f32>,
+    contrast: Vec<f32>,
+    transform: Arc<dyn RealToComplex<f32>>,
+    /// Buffers: the reduced panorama and planes of its size.
+    plane: Vec<f32>,
+    scratch: Vec<f32>,
+    east: Vec<f32>,
+    north: Vec<f32>,
+    local_mean: Vec<f32>,
+    bins: Vec<f32>,
+    spectrum: Vec<Complex<f32>>,
+    fft_scratch: Vec<Complex<f32>>,
+}
+
+impl Sizes {
+    pub const fn dimensions(self) -> usize {
+        BINS * self.bands * HARMONICS
+    }
+}
+
+impl GradientSignature {
+    pub fn new(sizes: Sizes) -> Self {
+        let (columns, rows) = (WIDE_COLUMNS / sizes.reduction, WIDE_ROWS / sizes.reduction);
+        let transform = RealFftPlanner::new().plan_fft_forward(columns);
+        let plane = || vec![0.0; columns * rows];
+        Self {
+            sizes,
+            columns,
+            rows,
+            blur: gaussian_kernel(sizes.blur_px),
+            contrast: gaussian_kernel(sizes.contrast_px),
+            plane: plane(),
+            scratch: plane(),
+            east: plane(),
+            north: plane(),
+            local_mean: plane(),
+            bins: vec![0.0; BINS * sizes.bands * columns],
+            spectrum: transform.make_output_vec(),
+            fft_scratch: transform.make_scratch_vec(),
+            transform,
+        }
+    }
+
+    pub fn describe(&mut self, panorama: &Panorama, properties: &mut [f32]) {
+        self.reduce_to_log(panorama);
+        blur(&mut self.plane, &mut self.scratch, self.columns, &self.blur);
+        self.differentiate();
+        blur(&mut self.local_mean, &mut self.scratch, self.columns, &self.contrast);
+        self.gather_orientations();
+        self.transform_bands(properties);
+    }
+
+    /// plane = log of the reduced panorama.
+    fn reduce_to_log(&mut self, panorama: &Panorama) {
+        let factor = self.sizes.reduction;
+        let area = (factor * factor) as f32;
+        for (row, reduced) in self.plane.chunks_exact_mut(self.columns).enumerate() {
+            reduced.fill(0.0);
+            for wide in panorama.wide[row * factor * WIDE_COLUMNS..].chunks_exact(WIDE_COLUMNS).take(factor) {
+                for (sum, group) in reduced.iter_mut().zip(wide.chunks_exact(factor)) {
+                    *sum += group.iter().sum::<f32>();
+                }
+            }
+            reduced.iter_mut().for_each(|sum| *sum = (*sum / area + DARK_LEVEL).ln());
+        }
+    }
+
+    /// east, north = ∇ plane (north: down the rows); local_mean = |∇ plane|.
+    fn differentiate(&mut self) {
+        let (columns, rows) = (self.columns, self.rows);
+        for row in 0..rows {
+            let at = row * columns;
+            let above = row.saturating_sub(1) * columns;
+            let below = (row + 1).min(rows - 1) * columns;
+            let here = &self.plane[at..at + columns];
+            let east = &mut self.east[at..at + columns];
+            for (slope, ends) in east[1..columns - 1].iter_mut().zip(here.windows(3)) {
+                *slope = 0.5 * (ends[2] - ends[0]);
+            }
+            east[0] = 0.5 * (here[1] - here[columns - 1]);
+            east[columns - 1] = 0.5 * (here[0] - here[columns - 2]);
+            let vertical = self.plane[above..above + columns].iter().zip(&self.plane[below..below + columns]);
+            for (slope, (above, below)) in self.north[at..at + columns].iter_mut().zip(vertical) {
+                *slope = 0.5 * (below - above);
+            }
+        }
+        for (norm, (east, north)) in self.local_mean.iter_mut().zip(self.east.iter().zip(&self.north)) {
+            *norm = (east * east + north * north).sqrt();
+        }
+    }
+
+    /// bins = h_b(e, a), bin × band × azimuth.
+    fn gather_orientations(&mut self) {
+        let (columns, bands) = (self.columns, self.sizes.bands);
+        let rows_a_band = self.rows / bands;
+        let plane = bands * columns;
+        self.bins.fill(0.0);
+        for i in 0..self.rows * columns {
+            let (east, north) = (self.east[i], self.north[i]);
+            let weight = (east * east + north * north).sqrt() / (self.local_mean[i] + CONTRAST_FLOOR);
+            let turn = atan2(north, east) * (BINS as f32 / TAU);
+            let position = if turn < 0.0 { turn + BINS as f32 } else { turn };
+            let bin = position as usize;
+            let share = position - bin as f32;
+            let at = i / columns / rows_a_band * columns + i % columns;
+            self.bins[bin % BINS * plane + at] += weight * (1.0 - share);
+            self.bins[(bin + 1) % BINS * plane + at] += weight * share;
+        }
+        let mean = 1.0 / rows_a_band as f32;
+        self.bins.iter_mut().for_each(|sum| *sum *= mean);
+    }
+
+    fn transform_bands(&mut self, properties: &mut [f32]) {
+        let columns = self.columns;
+        for (row, magnitudes) in self.bins.chunks_exact_mut(columns).zip(properties.chunks_exact_mut(HARMONICS)) {
+            self.transform
+                .process_with_scratch(row, &mut self.spectrum, &mut self.fft_scratch)
+                .expect("the buffers come from the plan");
+            for (magnitude, harmonic) in magnitudes.iter_mut().zip(&self.spectrum) {
+                *magnitude = (harmonic.norm() / columns as f32).sqrt();
+            }
+        }
+        let norm = properties.iter().map(|y| y * y).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+        properties.iter_mut().for_each(|y| *y /= norm);
+    }
+}
+
+/// Half of a symmetric Gaussian kernel, centre first, cut off at 3 σ; its sum over both halves is 1.
+fn gaussian_kernel(sigma: f32) -> Vec<f32> {
+    let radius = (3.0 * sigma).ceil() as i32;
+    let mut half: Vec<f32> = (0..=radius).map(|i| (-0.5 * (i as f32 / sigma).powi(2)).exp()).collect();
+    let sum = 2.0 * half.iter().sum::<f32>() - half[0];
+    half.iter_mut().for_each(|weight| *weight /= sum);
+    half
+}
+
+/// Blurs `plane` (rows of `columns`) in place with a separable kernel given by its half.
+fn blur(plane: &mut [f32], scratch: &mut [f32], columns: usize, half: &[f32]) {
+    let rows = plane.len() / columns;
+    // Down the columns, rows repeated at the rims.
+    for (row, blurred) in scratch.chunks_exact_mut(columns).enumerate() {
+        let center = &plane[row * columns..(row + 1) * columns];
+        blurred.iter_mut().zip(center).for_each(|(sum, value)| *sum = half[0] * value);
+        for (offset, &weight) in half.iter().enumerate().skip(1) {
+            let above = &plane[row.saturating_sub(offset) * columns..][..columns];
+            let below = &plane[(row + offset).min(rows - 1) * columns..][..columns];
+            for (sum, (above, below)) in blurred.iter_mut().zip(above.iter().zip(below)) {
+                *sum += weight * (above + below);
+            }
+        }
+    }
+    // Along the rows, which wrap round.
+    let mut wrapped = [0.0_f32; WIDE_COLUMNS + 2 * MAX_RADIUS];
+    let radius = half.len() - 1;
+    for (row, blurred) in scratch.chunks_exact(columns).zip(plane.chunks_exact_mut(columns)) {
+        let wrapped = &mut wrapped[..columns + 2 * radius];
+        wrapped[..radius].copy_from_slice(&row[columns - radius..]);
+        wrapped[radius..radius + columns].copy_from_slice(row);
+        wrapped[radius + columns..].copy_from_slice(&row[..radius]);
+        blurred.iter_mut().zip(row).for_each(|(sum, value)| *sum = half[0] * value);
+        for (offset, &weight) in half.iter().enumerate().skip(1) {
+            let left = &wrapped[radius - offset..];
+            let right = &wrapped[radius + offset..];
+            for (sum, (left, right)) in blurred.iter_mut().zip(left.iter().zip(right)) {
+                *sum += weight * (left + right);
+            }
+        }
+    }
+}
+
+/// Widest half kernel of the sizes above.
+const MAX_RADIUS: usize = 24;
+
+/// Direction of (x, y) in (−π, π], to 1e-5 rad: minimax polynomial of the arctangent on \[0, 1\] (Abramowitz & Stegun
+/// 4.4.49), extended by symmetry. Exact zero for the zero vector.
+fn atan2(y: f32, x: f32) -> f32 {
+    use std::f32::consts::{FRAC_PI_2, PI};
+    let (ax, ay) = (x.abs(), y.abs());
+    let ratio = ax.min(ay) / ax.max(ay).max(f32::MIN_POSITIVE);
+    let square = ratio * ratio;
+    let polynomial = 0.999_866
+        + square * (-0.330_299_5 + square * (0.180_141 + square * (-0.085_133 + square * 0.020_835_1)));
+    let first_octant = ratio * polynomial;
+    let first_quadrant = if ay > ax { FRAC_PI_2 - first_octant } else { first_octant };
+    let upper_half = if x < 0.0 { PI - first_quadrant } else { first_quadrant };
+    if y < 0.0 { -upper_half } else { upper_half }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::golden::golden_panorama;
+
+    fn textured() -> Panorama {
+        let mut panorama = golden_panorama();
+        for (i, value) in panorama.wide.iter_mut().enumerate() {
+            let (row, column) = ((i / WIDE_COLUMNS) as f32, (i % WIDE_COLUMNS) as f32);
+            let turn = TAU * column / WIDE_COLUMNS as f32;
+            *value = 120.0 + 60.0 * (3.0 * turn + row / 9.0).sin() + 30.0 * (17.0 * turn).cos() * (row / 5.0).sin();
+        }
+        panorama
+    }
+
+    fn describe(sizes: Sizes, panorama: &Panorama) -> Vec<f32> {
+        let mut properties = vec![0.0; sizes.dimensions()];
+        GradientSignature::new(sizes).describe(panorama, &mut properties);
+        properties
+    }
+
+    fn distance(a: &[f32], b: &[f32]) -> f32 {
+        a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt()
+    }
+
+    #[test]
+    fn a_turn_leaves_the_properties_as_they_are() {
+        for sizes in [FINE, COARSE] {
+            let before = describe(sizes, &textured());
+            let after = describe(sizes, &textured().rolled(8 * 29));
+            assert!(distance(&before, &after) < 2e-2, "{}", distance(&before, &after));
+        }
+    }
+
+    #[test]
+    fn light_hardly_matters_and_the_scene_does() {
+        let mut brighter = textured();
+        brighter.wide.iter_mut().for_each(|value| *value = 1.25 * *value + 3.0);
+        let mut other = textured();
+        for (i, value) in other.wide.iter_mut().enumerate() {
+            *value += 30.0 * ((i / WIDE_COLUMNS) as f32 / 3.0).sin();
+        }
+        for sizes in [FINE, COARSE] {
+            let here = describe(sizes, &textured());
+            assert!((here.iter().map(|y| y * y).sum::<f32>() - 1.0).abs() < 1e-5, "unit norm");
+            let (light, scene) = (distance(&here, &describe(sizes, &brighter)), distance(&here, &describe(sizes, &other)));
+            assert!(light < 0.05 && scene > 5.0 * light, "light {light}, scene {scene}");
+        }
+    }
+
+    #[test]
+    fn a_blank_panorama_has_a_descriptor() {
+        assert!(describe(FINE, &Panorama::zeros()).iter().all(|y| y.is_finite()));
+    }
+
+    #[test]
+    fn arctangent_is_close_to_the_library_s() {
+        for i in 0..1000 {
+            let angle = (i as f32 / 1000.0 - 0.5) * TAU * 0.9999;
+            assert!((atan2(3.0 * angle.sin(), 3.0 * angle.cos()) - angle).abs() < 2e-5, "{angle}");
+        }
+        assert_eq!(atan2(0.0, 0.0), 0.0);
+    }
+
+    #[test]
+    fn blurring_keeps_a_constant_and_wraps_round() {
+        let half = gaussian_kernel(2.0);
+        let (mut plane, mut scratch) = (vec![3.0; 32 * 8], vec![0.0; 32 * 8]);
+        blur(&mut plane, &mut scratch, 32, &half);
+        assert!(plane.iter().all(|value| (value - 3.0).abs() < 1e-5));
+        let mut spot = vec![0.0; 32 * 8];
+        spot[4 * 32] = 1.0;
+        blur(&mut spot, &mut scratch, 32, &half);
+        assert_eq!(spot[4 * 32 + 1], spot[4 * 32 + 31]);
+    }
+}

@@ -1,0 +1,214 @@
+//! Features whose noise is white: the default recipe's scaling.
+//!
+//! Whitening (eq. 1 of the paper) makes the spread *over places* the identity, so that a direction in which all places
+//! look alike counts as much as one that tells them apart. Here the noise *within a place* is made the identity
+//! instead, and the directions that vary most over places, measured in that noise, become the features: Fisher's
+//! discriminant (Rao 1948), with a Gaussian process as the model of what a place looks like.
+
+use faer::linalg::solvers::Svd;
+use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
+use faer::{Mat, MatRef, Par, Side};
+use serde::{Deserialize, Serialize};
+
+use crate::features::scaling::{Scaling, ScalingError};
+use crate::gp::{Hyperparameters, LearningPositions, fit::median_neighbour_spacing_m};
+
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Settings {
+    /// At most this many features.
+    pub features: usize,
+    /// Length scale as a multiple of the median distance to the nearest learning position.
+    pub length_scale_spacings: f64,
+    /// Added to the noise covariance, as a share of its mean eigenvalue: directions never seen to vary are not thereby
+    /// free of noise.
+    pub ridge: f64,
+}
+
+/// What is learned: the scaling, and one set of hyperparameters for all features.
+#[derive(Debug, Clone)]
+pub struct NoiseWhitening {
+    pub scaling: Scaling,
+    pub hyperparameters: Hyperparameters,
+}
+
+/// Directions whose singular value is below this share of the largest are null.
+const NULL_SINGULAR_RATIO: f64 = 1e-5;
+/// Noise-to-signal variance ratios that are tried: 2^−10, 2^−9.5, …, 2^2.5.
+const LOG2_NOISE_RATIOS: std::ops::RangeInclusive<i32> = -20..=5;
+
+/// Learns from `properties`, n × d, at `learning` positions, and `changes`, p × d: how the properties of learning images
+/// changed under perturbations (none is allowed).
+///
+/// 1. Y = mean + P D Vᵀ (thin SVD); Z = P D, n × r.
+/// 2. A Gaussian process with length scale ℓ = `length_scale_spacings` × the median spacing and noise ratio q for all
+///    directions; q minimises the squared leave-one-out error |E|², E_i = \[R⁻¹Z\]_i / \[R⁻¹\]_ii.
+/// 3. Noise covariance C = EᵀE/n + (ΔV)ᵀ(ΔV)/p + ridge · mean eigenvalue · I.
+/// 4. Generalised eigenvectors g of ZᵀZ/n g = λ C g with gᵀ C g = 1, largest λ first; features z = gᵀ Vᵀ (y − mean).
+/// 5. The predictive variance is scaled to 1 on average over the learning positions, as step 3 has it.
+///
+/// # Errors
+/// As [`Scaling::learn`].
+pub fn learn(
+    settings: &Settings,
+    learning: &LearningPositions,
+    properties: MatRef<f64>,
+    changes: MatRef<f64>,
+) -> Result<NoiseWhitening, ScalingError> {
+    let (n, d) = (properties.nrows(), properties.ncols());
+    if n < 2 {
+        return Err(ScalingError::TooFewImages { rows: n });
+    }
+    let mean: Vec<f64> = (0..d).map(|k| properties.col(k).iter().sum::<f64>() / n as f64).collect();
+    let centered = Mat::from_fn(n, d, |i, k| properties[(i, k)] - mean[k]);
+    let svd = Svd::new_thin(centered.as_ref()).map_err(|_| ScalingError::NoVariance { rows: n })?;
+    let singular: Vec<f64> = svd.S().column_vector().iter().copied().collect();
+    let largest = singular.first().copied().unwrap_or(0.0);
+    let rank = singular.iter().take_while(|&&s| s > NULL_SINGULAR_RATIO * largest).count();
+    if rank == 0 {
+        return Err(ScalingError::NoVariance { rows: n });
+    }
+    let basis = svd.V().subcols(0, rank);
+    let z = Mat::from_fn(n, rank, |i, r| svd.U()[(i, r)] * singular[r]);
+
+    let length_m = (settings.length_scale_spacings * median_neighbour_spacing_m(learning.positions())).max(1e-6);
+    let unit = Hyperparameters { signal_std: 1.0, noise_std: 0.0, length_scale_m: [length_m; 2] };
+    let loo = leave_one_out(learning, z.as_ref(), &unit);
+
+    let mut noise = loo.residual.transpose() * &loo.residual * (1.0 / n as f64);
+    if changes.nrows() > 0 {
+        let projected = changes * basis;
+        noise += projected.transpose() * &projected * (1.0 / changes.nrows() as f64);
+    }
+    let mean_eigenvalue = (0..rank).map(|r| noise[(r, r)]).sum::<f64>() / rank as f64;
+    for r in 0..rank {
+        noise[(r, r)] += settings.ridge * mean_eigenvalue + f64::MIN_POSITIVE;
+    }
+    let signal = z.transpose() * &z * (1.0 / n as f64);
+    let directions =
+        discriminant_directions(&signal, &noise, settings.features).ok_or(ScalingError::NoVariance { rows: n })?;
+    let projection = (basis * directions).transpose().to_owned();
+    let scale = 1.0 / loo.mean_variance;
+    let hyperparameters = Hyperparameters {
+        signal_std: scale.sqrt(),
+        noise_std: (loo.noise_ratio * scale).sqrt(),
+        length_scale_m: [length_m; 2],
+    };
+    Ok(NoiseWhitening { scaling: Scaling { mean, projection }, hyperparameters })
+}
+
+struct LeaveOneOut {
+    noise_ratio: f64,
+    /// E, n × r.
+    residual: Mat<f64>,
+    /// Mean of 1/\[R⁻¹\]_ii: the predictive variance at the learning positions, for unit signal variance.
+    mean_variance: f64,
+}
+
+/// Leave-one-out residuals of all columns of `z` at the noise ratio that makes their sum of squares least.
+fn leave_one_out(learning: &LearningPositions, z: MatRef<f64>, unit: &Hyperparameters) -> LeaveOneOut {
+    let n = learning.len();
+    let eigen = learning.correlation_eigen(unit);
+    let rotated = eigen.vectors.transpose() * z;
+    LOG2_NOISE_RATIOS
+        .map(|half_log2| {
+            let noise_ratio = 2.0_f64.powf(0.5 * f64::from(half_log2));
+            let reciprocal: Vec<f64> = eigen.values.iter().map(|value| 1.0 / (value + noise_ratio)).collect();
+            let variance: Vec<f64> = (0..n)
+                .map(|i| 1.0 / (0..n).map(|k| eigen.vectors[(i, k)].powi(2) * reciprocal[k]).sum::<f64>())
+                .collect();
+            let scaled = Mat::from_fn(n, z.ncols(), |k, r| reciprocal[k] * rotated[(k, r)]);
+            let weights = &eigen.vectors * scaled;
+            let residual = Mat::from_fn(n, z.ncols(), |i, r| weights[(i, r)] * variance[i]);
+            let mean_variance = variance.iter().sum::<f64>() / n as f64;
+            LeaveOneOut { noise_ratio, residual, mean_variance }
+        })
+        .min_by(|a, b| a.residual.squared_norm_l2().total_cmp(&b.residual.squared_norm_l2()))
+        .expect("ratios are tried")
+}
+
+/// The `count` generalised eigenvectors of largest λ of signal g = λ noise g, as columns with gᵀ noise g = 1; each one's
+/// largest entry positive.
+fn discriminant_directions(signal: &Mat<f64>, noise: &Mat<f64>, count: usize) -> Option<Mat<f64>> {
+    let factor = noise.llt(Side::Lower).ok()?;
+    // L⁻¹ S L⁻ᵀ, whose eigenvectors w give g = L⁻ᵀ w.
+    let mut half = signal.clone();
+    solve_lower_triangular_in_place(factor.L(), half.as_mut(), Par::Seq);
+    let mut whitened = half.transpose().to_owned();
+    solve_lower_triangular_in_place(factor.L(), whitened.as_mut(), Par::Seq);
+    let eigen = whitened.self_adjoint_eigen(Side::Lower).ok()?;
+    let rank = signal.nrows();
+    let count = count.min(rank);
+    // Eigenvalues come in rising order.
+    let mut directions = Mat::from_fn(rank, count, |i, r| eigen.U()[(i, rank - 1 - r)]);
+    solve_upper_triangular_in_place(factor.L().transpose(), directions.as_mut(), Par::Seq);
+    for r in 0..count {
+        let dominant =
+            directions.col(r).iter().fold(0.0_f64, |most, &v| if v.abs() > most.abs() { v } else { most });
+        directions.col_mut(r).iter_mut().for_each(|v| *v *= dominant.signum());
+    }
+    Some(directions)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 60 positions on a line; property 0 follows the place, 1 is loud noise, 2 follows the place but changes from day
+    /// to day, 3 is constant.
+    fn drive() -> (LearningPositions, Mat<f64>, Mat<f64>) {
+        let learning = LearningPositions::new((0..60).map(|i| [f64::from(i), 0.0]).collect());
+        let noise = |i: usize, k: usize| ((i * 7919 + k * 104_729) as f64 * 12.9898).sin();
+        let properties = Mat::from_fn(60, 4, |i, k| match k {
+            0 => (0.15 * i as f64).sin() + 0.02 * noise(i, 0),
+            1 => 5.0 * noise(i, 1),
+            2 => (0.11 * i as f64).cos() + 0.02 * noise(i, 2),
+            _ => 4.0,
+        });
+        let changes = Mat::from_fn(120, 4, |i, k| if k == 2 { 3.0 * noise(i, 9) } else { 0.0 });
+        (learning, properties, changes)
+    }
+
+    const SETTINGS: Settings = Settings { features: 96, length_scale_spacings: 2.0, ridge: 0.05 };
+
+    #[test]
+    fn the_first_feature_tells_places_apart_and_days_do_not_move_it() {
+        let (learning, properties, changes) = drive();
+        let learned = learn(&SETTINGS, &learning, properties.as_ref(), changes.as_ref()).expect("varies");
+        assert_eq!(learned.scaling.features(), 3);
+        let first = |k: usize| learned.scaling.projection[(0, k)].abs();
+        assert!(first(0) > 10.0 * first(1) && first(0) > 10.0 * first(2), "{:?}", learned.scaling.projection);
+        let calm = learn(&SETTINGS, &learning, properties.as_ref(), Mat::zeros(0, 4).as_ref()).expect("varies");
+        let strength = |scaling: &Scaling, k: usize| (0..2).map(|r| scaling.projection[(r, k)].powi(2)).sum::<f64>();
+        assert!(strength(&calm.scaling, 2) > 10.0 * strength(&learned.scaling, 2));
+    }
+
+    #[test]
+    fn leave_one_out_equals_that_of_the_posterior() {
+        let (learning, properties, _) = drive();
+        let unit = Hyperparameters { signal_std: 1.0, noise_std: 0.0, length_scale_m: [2.0; 2] };
+        let loo = leave_one_out(&learning, properties.as_ref(), &unit);
+        let hyperparameters = Hyperparameters { noise_std: loo.noise_ratio.sqrt(), ..unit };
+        let posterior =
+            crate::gp::Posterior::new(&learning, properties.as_ref(), hyperparameters).expect("positive definite");
+        let (residual, variance) = posterior.leave_one_out();
+        assert!((&residual - &loo.residual).norm_max() < 1e-8);
+        assert!((variance.iter().sum::<f64>() / 60.0 - loo.mean_variance).abs() < 1e-8);
+    }
+
+    #[test]
+    fn directions_are_of_unit_noise_and_uncorrelated() {
+        let noise = Mat::from_fn(3, 3, |i, j| if i == j { 2.0 + i as f64 } else { 0.5 });
+        let signal = Mat::from_fn(3, 3, |i, j| ((i + 1) * (j + 1)) as f64 + if i == j { 1.0 } else { 0.0 });
+        let directions = discriminant_directions(&signal, &noise, 3).expect("positive definite");
+        let white = directions.transpose() * &noise * &directions;
+        let diagonal = directions.transpose() * &signal * &directions;
+        for r in 0..3 {
+            for s in 0..3 {
+                assert!((white[(r, s)] - f64::from(u8::from(r == s))).abs() < 1e-9);
+                assert!(r == s || diagonal[(r, s)].abs() < 1e-9);
+            }
+        }
+        assert!(diagonal[(0, 0)] > diagonal[(1, 1)] && diagonal[(1, 1)] > diagonal[(2, 2)]);
+    }
+}
