@@ -1,0 +1,267 @@
+//! Recordings → positions and properties of every frame: what training and evaluation work on.
+
+use std::collections::BTreeMap;
+
+use faer::Mat;
+use rayon::prelude::*;
+
+use super::perturbation::perturbed;
+use crate::features::{Describer, Descriptor};
+use crate::jpeg::LumaDecoder;
+use crate::panorama::{Panorama, UnwrapTable};
+use crate::recording::{Recording, RecordingError, SurveyFrame};
+use crate::types::{DonutCalibration, Geodetic, PositionM};
+
+/// All usable frames of one or more recordings of a place.
+#[derive(Debug, Clone)]
+pub struct Survey {
+    pub calibration: DonutCalibration,
+    pub origin: Option<Geodetic>,
+    /// Width and height of the camera images \[px\].
+    pub image_size_px: (usize, usize),
+    pub frames: Vec<SurveyedFrame>,
+    properties: BTreeMap<Descriptor, Properties>,
+}
+
+/// One frame, without its pixels.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SurveyedFrame {
+    /// Which of the recordings, counted from 0.
+    pub recording: usize,
+    /// The frame's own index in its recording.
+    pub index: usize,
+    pub stamp_ns: u64,
+    pub position_m: PositionM,
+    pub yaw_rad: Option<f64>,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Properties {
+    /// Frame × property.
+    clean: Vec<f32>,
+    /// Frame × repetition × property: perturbed minus clean.
+    changes: Vec<f32>,
+}
+
+/// What is to be computed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SurveyOptions {
+    pub descriptors: Vec<Descriptor>,
+    /// Turn every panorama by its yaw so that column 0 looks east: the paper's “(fixed)” rows.
+    pub fixed: bool,
+    /// Perturbed copies of every frame, for the descriptors in `perturbed`.
+    pub repetitions: usize,
+    pub perturbed: Vec<Descriptor>,
+    pub seed: u64,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum SurveyError {
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    #[error("{recording}: frame {index}")]
+    Frame { recording: String, index: usize, source: crate::jpeg::JpegError },
+    #[error(
+        "{recording}: frame {index} is {found:?} px, the frames before it {expected:?} px: one camera setting a recording"
+    )]
+    SizeChanged { recording: String, index: usize, found: (usize, usize), expected: (usize, usize) },
+    #[error("{recording}")]
+    Calibration { recording: String, source: crate::types::CalibrationError },
+    #[error(
+        "mixed calibrations: {first} has {expected}, {other} has {found}; \
+         a map is of one lens: calibrate both alike or train two maps"
+    )]
+    MixedCalibrations { first: String, other: String, expected: String, found: String },
+    #[error("{first} and {other} have different origins: their positions cannot be put into one map")]
+    MixedOrigins { first: String, other: String },
+    #[error("{recording}: frame {index} has no yaw, which turning the panorama needs")]
+    NoYaw { recording: String, index: usize },
+}
+
+/// Frames decoded and described at a time: bounds the memory.
+const BATCH: usize = 64;
+
+impl Survey {
+    /// Reads every usable frame of `recordings`. `on_frames` is told how many more are done.
+    ///
+    /// # Errors
+    /// Names the recording and the frame.
+    pub fn read(
+        recordings: &[Recording],
+        options: &SurveyOptions,
+        on_frames: impl Fn(usize),
+    ) -> Result<Self, SurveyError> {
+        let first = &recordings[0];
+        let calibration = first.calibration()?.clone();
+        let mut survey = Self {
+            calibration,
+            origin: first.origin,
+            image_size_px: (0, 0),
+            frames: Vec::new(),
+            properties: options.descriptors.iter().map(|&descriptor| (descriptor, Properties::default())).collect(),
+        };
+        for (number, recording) in recordings.iter().enumerate() {
+            survey.check_same_lens(first, recording)?;
+            let mut batch: Vec<(SurveyFrame, Vec<u8>)> = Vec::with_capacity(BATCH);
+            for frame in recording.frames()? {
+                batch.push(frame?);
+                if batch.len() == BATCH {
+                    survey.describe(number, recording, options, &batch)?;
+                    on_frames(batch.len());
+                    batch.clear();
+                }
+            }
+            if !batch.is_empty() {
+                survey.describe(number, recording, options, &batch)?;
+                on_frames(batch.len());
+            }
+        }
+        Ok(survey)
+    }
+
+    fn check_same_lens(&self, first: &Recording, recording: &Recording) -> Result<(), SurveyError> {
+        let found = recording.calibration()?;
+        let names = || (first.path.display().to_string(), recording.path.display().to_string());
+        if *found != self.calibration {
+            let (first, other) = names();
+            let describe = |c: &DonutCalibration| {
+                let (x, y) = (c.center_x_px, c.center_y_px);
+                format!("centre ({x}, {y}) and radii {}..{} px", c.inner_radius_px, c.outer_radius_px)
+            };
+            let (expected, found) = (describe(&self.calibration), describe(found));
+            return Err(SurveyError::MixedCalibrations { first, other, expected, found });
+        }
+        if recording.origin != self.origin {
+            let (first, other) = names();
+            return Err(SurveyError::MixedOrigins { first, other });
+        }
+        Ok(())
+    }
+
+    /// Decodes, unwraps and describes a batch in parallel and appends it.
+    fn describe(
+        &mut self,
+        number: usize,
+        recording: &Recording,
+        options: &SurveyOptions,
+        batch: &[(SurveyFrame, Vec<u8>)],
+    ) -> Result<(), SurveyError> {
+        let name = || recording.path.display().to_string();
+        let in_frame = |index: usize| move |source| SurveyError::Frame { recording: name(), index, source };
+        let first = self.frames.len();
+        let size_px = match self.frames.last() {
+            Some(frame) if frame.recording == number => self.image_size_px,
+            _ => {
+                let (frame, jpeg) = &batch[0];
+                let mut decoder = LumaDecoder::new();
+                let image = decoder.decode(jpeg).map_err(in_frame(frame.index))?;
+                (image.width_px, image.height_px)
+            }
+        };
+        self.image_size_px = size_px;
+        let table = UnwrapTable::build(&self.calibration, size_px.0, size_px.1)
+            .map_err(|source| SurveyError::Calibration { recording: name(), source })?;
+
+        let described: Vec<Vec<(Vec<f32>, Vec<f32>)>> = batch
+            .par_iter()
+            .enumerate()
+            .map_init(
+                || (LumaDecoder::new(), Describer::new(), Panorama::zeros()),
+                |(decoder, describer, panorama), (i, (frame, jpeg))| {
+                    let image = decoder.decode(jpeg).map_err(in_frame(frame.index))?;
+                    let found = (image.width_px, image.height_px);
+                    if found != size_px {
+                        let (recording, index) = (name(), frame.index);
+                        return Err(SurveyError::SizeChanged { recording, index, found, expected: size_px });
+                    }
+                    let turned = match (options.fixed, frame.yaw_rad) {
+                        (false, _) => 0,
+                        (true, Some(yaw_rad)) => table.columns_to_east(yaw_rad),
+                        (true, None) => return Err(SurveyError::NoYaw { recording: name(), index: frame.index }),
+                    };
+                    table.unwrap_into(image, turned, panorama);
+                    Ok(describe_frame(describer, panorama, options, (first + i) as u64))
+                },
+            )
+            .collect::<Result<_, SurveyError>>()?;
+
+        for ((frame, _), properties) in batch.iter().zip(described) {
+            self.frames.push(SurveyedFrame {
+                recording: number,
+                index: frame.index,
+                stamp_ns: frame.stamp_ns,
+                position_m: frame.position_m,
+                yaw_rad: frame.yaw_rad,
+            });
+            for (descriptor, (clean, changes)) in options.descriptors.iter().zip(properties) {
+                let of_descriptor = self.properties.get_mut(descriptor).expect("made for these descriptors");
+                of_descriptor.clean.extend(clean);
+                of_descriptor.changes.extend(changes);
+            }
+        }
+        Ok(())
+    }
+
+    pub fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// Positions as recorded \[m\].
+    pub fn positions_m(&self) -> Vec<PositionM> {
+        self.frames.iter().map(|frame| frame.position_m).collect()
+    }
+
+    /// Properties of the frames at `rows`, n × d.
+    ///
+    /// # Panics
+    /// When the survey was read without this descriptor.
+    pub fn properties(&self, descriptor: Descriptor, rows: &[usize]) -> Mat<f64> {
+        let (values, d) = (&self.properties[&descriptor].clean, descriptor.dimensions());
+        Mat::from_fn(rows.len(), d, |i, k| f64::from(values[rows[i] * d + k]))
+    }
+
+    /// How perturbations changed the properties of the frames at `rows`, (n · repetitions) × d; no rows for a descriptor
+    /// that was not perturbed.
+    pub fn changes(&self, descriptor: Descriptor, rows: &[usize]) -> Mat<f64> {
+        let (values, d) = (&self.properties[&descriptor].changes, descriptor.dimensions());
+        let repetitions = values.len() / (self.frames.len() * d).max(1);
+        let at = |i: usize| (rows[i / repetitions] * repetitions + i % repetitions) * d;
+        Mat::from_fn(rows.len() * repetitions, d, |i, k| f64::from(values[at(i) + k]))
+    }
+}
+
+/// Properties of one panorama, and how they change under perturbations: a pair a descriptor.
+fn describe_frame(
+    describer: &mut Describer,
+    panorama: &Panorama,
+    options: &SurveyOptions,
+    stream: u64,
+) -> Vec<(Vec<f32>, Vec<f32>)> {
+    let describe = |describer: &mut Describer, descriptor: Descriptor, panorama: &Panorama| {
+        let mut properties = vec![0.0; descriptor.dimensions()];
+        describer.describe(descriptor, panorama, &mut properties);
+        properties
+    };
+    let mut described: Vec<(Vec<f32>, Vec<f32>)> = options
+        .descriptors
+        .iter()
+        .map(|&descriptor| (describe(describer, descriptor, panorama), Vec::new()))
+        .collect();
+    if options.perturbed.is_empty() {
+        return described;
+    }
+    for repetition in 0..options.repetitions as u64 {
+        let other_day = perturbed(panorama, options.seed, stream * options.repetitions as u64 + repetition);
+        for (descriptor, (clean, changes)) in options.descriptors.iter().zip(&mut described) {
+            if options.perturbed.contains(descriptor) {
+                let properties = describe(describer, *descriptor, &other_day);
+                changes.extend(properties.iter().zip(&*clean).map(|(there, here)| there - here));
+            }
+        }
+    }
+    described
+}
