@@ -7,8 +7,13 @@ use prost::Message;
 use protox::Compiler;
 
 /// Messages that are written to a topic; what they import comes along.
-const TOPIC_MESSAGES: [&str; 5] =
-    ["foxglove/CompressedImage", "foxglove/LocationFix", "foxglove/PoseInFrame", "omniloc/Heading", "omniloc/SurveyPair"];
+const TOPIC_MESSAGES: [&str; 5] = [
+    "foxglove/CompressedImage",
+    "foxglove/LocationFix",
+    "foxglove/PoseInFrame",
+    "omniloc/Heading",
+    "omniloc/SurveyPair",
+];
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed=proto");
