@@ -1,5 +1,6 @@
 //! omniloc tells a vehicle where it is from one omnidirectional camera.
 
+pub mod commands;
 pub mod evaluate;
 pub mod features;
 #[cfg(test)]
@@ -9,5 +10,6 @@ pub mod jpeg;
 pub mod localize;
 pub mod map;
 pub mod panorama;
+pub mod recording;
 pub mod train;
 pub mod types;

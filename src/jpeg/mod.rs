@@ -1,5 +1,7 @@
-//! JPEG in, luma out.
+//! JPEG frames: is it a whole image, how large is it, what a webcam leaves out, and its luma.
 
 mod decode;
+mod markers;
 
 pub use decode::{JpegError, LumaDecoder};
+pub use markers::{JpegInfo, MarkerError, scan, with_huffman_tables};

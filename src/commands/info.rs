@@ -1,0 +1,168 @@
+//! `omniloc info`: what is in a recording or map.
+
+use std::{fs, path::PathBuf, process::ExitCode};
+
+use anyhow::Context;
+use serde_json::json;
+
+use super::{
+    DONE,
+    file_kind::{FileKind, file_kind},
+};
+use crate::recording::{Recording, TopicSummary};
+
+/// Show what is in a recording or map
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Recording or map
+    pub file: PathBuf,
+    /// Print one JSON object
+    #[arg(long)]
+    pub json: bool,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    match file_kind(&args.file).with_context(|| format!("reading {}", args.file.display()))? {
+        FileKind::Map => anyhow::bail!("{}: maps are not supported yet", args.file.display()),
+        FileKind::Recording => {}
+    }
+    let recording = Recording::open_any(&args.file)?;
+    let size_bytes = fs::metadata(&args.file).map(|facts| facts.len()).unwrap_or_default();
+    if args.json {
+        println!("{:#}", as_json(&recording, size_bytes));
+    } else {
+        print!("{}", as_text(&recording, size_bytes));
+    }
+    Ok(DONE.into())
+}
+
+/// Seconds between the first and the last message of all topics.
+fn duration_s(recording: &Recording) -> f64 {
+    let first_ns = recording.topics.values().map(|topic| topic.first_ns).min().unwrap_or_default();
+    let last_ns = recording.topics.values().map(|topic| topic.last_ns).max().unwrap_or_default();
+    last_ns.saturating_sub(first_ns) as f64 * 1e-9
+}
+
+/// Messages a second, counted between the first and the last.
+fn rate_hz(topic: &TopicSummary) -> Option<f64> {
+    let span_s = topic.last_ns.saturating_sub(topic.first_ns) as f64 * 1e-9;
+    (span_s > 0.0).then(|| (topic.messages - 1) as f64 / span_s)
+}
+
+/// Smallest and largest east, north \[m\] of the usable frames.
+fn extent_m(recording: &Recording) -> Option<[[f64; 2]; 2]> {
+    let range = |axis: usize| {
+        let along = recording.survey.iter().map(move |frame| frame.position_m[axis]);
+        Some([along.clone().reduce(f64::min)?, along.reduce(f64::max)?])
+    };
+    Some([range(0)?, range(1)?])
+}
+
+/// Way from frame to frame \[m\].
+fn length_m(recording: &Recording) -> f64 {
+    let pairs = recording.survey.windows(2);
+    pairs.map(|pair| crate::types::distance_m(pair[0].position_m, pair[1].position_m)).sum()
+}
+
+fn with_yaw(recording: &Recording) -> usize {
+    recording.survey.iter().filter(|frame| frame.yaw_rad.is_some()).count()
+}
+
+fn as_json(recording: &Recording, size_bytes: u64) -> serde_json::Value {
+    let topics: serde_json::Map<_, _> = recording
+        .topics
+        .iter()
+        .map(|(name, topic)| {
+            let facts = json!({
+                "schema": topic.schema_name, "messages": topic.messages, "rate_hz": rate_hz(topic),
+                "first_ns": topic.first_ns, "last_ns": topic.last_ns,
+            });
+            (name.clone(), facts)
+        })
+        .collect();
+    let extent = extent_m(recording);
+    json!({
+        "file": recording.path,
+        "kind": "recording",
+        "name": recording.name,
+        "size_bytes": size_bytes,
+        "duration_s": duration_s(recording),
+        "topics": topics,
+        "image_size_px": recording.image_size_px,
+        "usable_frames": recording.survey.len(),
+        "frames_with_yaw": with_yaw(recording),
+        "unusable_pairs": recording.unusable.len(),
+        "images_without_pair": recording.images_without_pair,
+        "east_range_m": extent.map(|[east, _]| east),
+        "north_range_m": extent.map(|[_, north]| north),
+        "length_m": length_m(recording),
+        "origin": recording.origin.map(|origin| json!({
+            "latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg, "altitude_m": origin.altitude_m,
+        })),
+        "calibration": recording.calibration().ok(),
+        "metadata": recording.metadata,
+    })
+}
+
+fn as_text(recording: &Recording, size_bytes: u64) -> String {
+    let mut lines: Vec<(String, String)> = Vec::new();
+    let mut line = |label: &str, text: String| lines.push((label.into(), printable(&text)));
+    line("recording", recording.name.clone());
+    line("size", format!("{:.1} MB", size_bytes as f64 * 1e-6));
+    line("duration", format!("{:.1} s", duration_s(recording)));
+    if let Some((width_px, height_px)) = recording.image_size_px {
+        line("images", format!("{width_px} x {height_px} px"));
+    }
+    line("usable frames", format!("{}, {} of them with yaw", recording.survey.len(), with_yaw(recording)));
+    if !recording.unusable.is_empty() {
+        line("unusable pairs", recording.unusable.len().to_string());
+    }
+    if recording.images_without_pair > 0 {
+        line("without pair", format!("{} images", recording.images_without_pair));
+    }
+    if let Some([east, north]) = extent_m(recording) {
+        let (width_m, height_m) = (east[1] - east[0], north[1] - north[0]);
+        line("extent", format!("{width_m:.1} x {height_m:.1} m, way {:.1} m", length_m(recording)));
+        line("east", format!("{:.2} .. {:.2} m", east[0], east[1]));
+        line("north", format!("{:.2} .. {:.2} m", north[0], north[1]));
+    }
+    line(
+        "origin",
+        match recording.origin {
+            Some(o) => format!("{:.7}, {:.7} deg, {:.1} m", o.latitude_deg, o.longitude_deg, o.altitude_m),
+            None => "unknown: positions are local metres".into(),
+        },
+    );
+    line(
+        "calibration",
+        match recording.calibration() {
+            Ok(donut) => format!(
+                "donut, centre ({}, {}), radii {} .. {} px",
+                donut.center_x_px, donut.center_y_px, donut.inner_radius_px, donut.outer_radius_px
+            ),
+            Err(_) => "none: run `omniloc calibrate`".into(),
+        },
+    );
+    let mut text: String = lines.iter().map(|(label, text)| format!("{label:<15}{text}\n")).collect();
+
+    let name_width = recording.topics.keys().map(String::len).max().unwrap_or(0).max(5);
+    text += &format!("\n{:<name_width$}  {:>9}  {:>9}  schema\n", "topic", "messages", "rate");
+    for (name, topic) in &recording.topics {
+        let rate = rate_hz(topic).map_or("-".into(), |hz| format!("{hz:.2} Hz"));
+        let (name, schema) = (printable(name), printable(&topic.schema_name));
+        text += &format!("{name:<name_width$}  {:>9}  {rate:>9}  {schema}\n", topic.messages);
+    }
+    for (record, entries) in &recording.metadata {
+        let key_width = entries.keys().map(String::len).max().unwrap_or(0);
+        text += &format!("\n{}\n", printable(record));
+        for (key, value) in entries {
+            text += &format!("  {:<key_width$}  {}\n", printable(key), printable(value));
+        }
+    }
+    text
+}
+
+/// Text from a file must not steer the terminal.
+fn printable(text: &str) -> String {
+    text.chars().map(|character| if character.is_control() { '\u{FFFD}' } else { character }).collect()
+}

@@ -1,0 +1,43 @@
+//! The commands: one file each. Results go to stdout, diagnostics to stderr.
+
+pub mod check;
+pub mod export;
+pub mod file_kind;
+pub mod import;
+pub mod info;
+pub mod options;
+
+use std::process::ExitCode;
+
+use clap::Subcommand;
+
+/// Done.
+pub const DONE: u8 = 0;
+/// The command could not do its work.
+pub const FAILED: u8 = 1;
+/// Bad arguments or a bad configuration file.
+pub const BAD_ARGUMENTS: u8 = 2;
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    Import(import::Args),
+    Export(export::Args),
+    Info(info::Args),
+    Check(check::Args),
+}
+
+impl Command {
+    pub fn run(&self) -> anyhow::Result<ExitCode> {
+        match self {
+            Self::Import(args) => import::run(args),
+            Self::Export(args) => export::run(args),
+            Self::Info(args) => info::run(args),
+            Self::Check(args) => check::run(args),
+        }
+    }
+}
+
+/// An error that is the caller's: it ends the program with [`BAD_ARGUMENTS`].
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct BadArgument(pub String);

@@ -1,0 +1,60 @@
+//! Argument values that several commands take.
+
+use std::{fs, path::Path};
+
+use super::BadArgument;
+use crate::types::Geodetic;
+
+/// `LAT,LON` or `LAT,LON,ALT`: degrees and metres above the ellipsoid.
+pub fn parse_origin(text: &str) -> Result<Geodetic, String> {
+    let expected = "expected LAT,LON or LAT,LON,ALT in degrees (±90, ±180) and metres, such as 40.82,-73.9";
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
+    let (latitude_deg, longitude_deg, altitude_m) = match numbers.as_deref() {
+        Ok(&[latitude_deg, longitude_deg]) => (latitude_deg, longitude_deg, 0.0),
+        Ok(&[latitude_deg, longitude_deg, altitude_m]) => (latitude_deg, longitude_deg, altitude_m),
+        _ => return Err(expected.into()),
+    };
+    let origin = Geodetic { latitude_deg, longitude_deg, altitude_m };
+    if origin.is_plausible() { Ok(origin) } else { Err(expected.into()) }
+}
+
+/// What an output must be for `--force` to replace it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OutputKind {
+    File,
+    Folder,
+}
+
+/// Refuses an output that exists, unless `force` is given and it is of the kind that will be written.
+pub fn check_output(out: &Path, kind: OutputKind, force: bool) -> Result<(), BadArgument> {
+    let Ok(facts) = fs::symlink_metadata(out) else { return Ok(()) };
+    let is_kind = match kind {
+        OutputKind::File => facts.is_file(),
+        OutputKind::Folder => facts.is_dir(),
+    };
+    match (is_kind, force) {
+        (true, true) => Ok(()),
+        (true, false) => {
+            Err(BadArgument(format!("--out {}: exists already; give --force to replace it", out.display())))
+        }
+        (false, _) => {
+            let expected = if kind == OutputKind::File { "a regular file" } else { "a folder" };
+            Err(BadArgument(format!("--out {}: exists and is not {expected}; choose another name", out.display())))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn origins_are_read_or_refused() {
+        let origin = parse_origin("40.82, -73.9").expect("two numbers");
+        assert_eq!((origin.latitude_deg, origin.longitude_deg, origin.altitude_m), (40.82, -73.9, 0.0));
+        assert_eq!(parse_origin("1,2,3").expect("three numbers").altitude_m, 3.0);
+        for bad in ["", "1", "91,0", "0,181", "NaN,0", "1,2,3,4", "a,b", "1;2", "0,0,inf"] {
+            assert!(parse_origin(bad).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! Recordings: MCAP files that hold frames, positions and what is needed to use them.
+//!
+//! A *frame* is one image of the camera; a *pair* says where the vehicle was when that frame was exposed. They are
+//! linked by the frame's sequence number. Positions are metres east and north from the recording's origin; where that
+//! origin lies on the Earth may be unknown.
+
+mod dataset;
+mod error;
+mod export;
+mod import;
+pub mod proto;
+mod reader;
+mod records;
+pub mod topics;
+mod verify;
+mod writer;
+
+pub use dataset::{Dataset, DatasetError};
+pub use error::RecordingError;
+pub use export::{ExportError, ExportReport, Format, export};
+pub use import::{CalibrationSource, ImportReport, ImportSettings, import};
+pub use reader::{Frames, Recording, SurveyFrame, TopicSummary};
+pub use verify::{Verdict, verify};
+pub use writer::{RecordingWriter, write_file_atomically};

@@ -1,0 +1,60 @@
+//! The topics of a recording: name, schema, content.
+//!
+//! | topic | schema | content |
+//! |---|---|---|
+//! | `/camera/image` | foxglove.CompressedImage | the JPEG; the MCAP sequence number is the frame's number |
+//! | `/gnss/fix` | foxglove.LocationFix | position on WGS84, only if the origin is known |
+//! | `/gnss/heading` | omniloc.Heading | yaw and where it came from |
+//! | `/survey/pair` | omniloc.SurveyPair | where the vehicle was when a frame was exposed |
+//! | `/survey/pose` | foxglove.PoseInFrame | the same in the frame `map`, for viewers |
+
+/// A topic and the schema of its messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Topic {
+    pub name: &'static str,
+    pub schema_name: &'static str,
+    /// Serialized `FileDescriptorSet` with everything the message imports.
+    pub schema: &'static [u8],
+}
+
+macro_rules! topic {
+    ($name:literal, $schema:literal) => {
+        Topic {
+            name: $name,
+            schema_name: $schema,
+            schema: include_bytes!(concat!(env!("OUT_DIR"), "/", $schema, ".fds")),
+        }
+    };
+}
+
+pub const CAMERA_IMAGE: Topic = topic!("/camera/image", "foxglove.CompressedImage");
+pub const GNSS_FIX: Topic = topic!("/gnss/fix", "foxglove.LocationFix");
+pub const GNSS_HEADING: Topic = topic!("/gnss/heading", "omniloc.Heading");
+pub const SURVEY_PAIR: Topic = topic!("/survey/pair", "omniloc.SurveyPair");
+pub const SURVEY_POSE: Topic = topic!("/survey/pose", "foxglove.PoseInFrame");
+
+/// The ENU frame of all positions.
+pub const MAP_FRAME: &str = "map";
+/// The camera's frame of reference.
+pub const CAMERA_FRAME: &str = "camera";
+/// The receiver's frame of reference.
+pub const GNSS_FRAME: &str = "gnss";
+
+/// The attachment that holds the donut calibration, as JSON.
+pub const CALIBRATION_ATTACHMENT: &str = "donut.json";
+
+/// Metadata records.
+pub mod metadata {
+    /// Program and version that wrote the recording.
+    pub const PROGRAM: &str = "program";
+    /// Resolved settings.
+    pub const SETTINGS: &str = "settings";
+    /// Name and kind of the source.
+    pub const SOURCE: &str = "source";
+    /// Frames and units, for people.
+    pub const CONVENTIONS: &str = "conventions";
+    /// Where east = north = 0 lies: `latitude_deg`, `longitude_deg`, `altitude_m`. Absent if unknown.
+    pub const ORIGIN: &str = "origin";
+    /// Size of the images and what is known about the camera.
+    pub const CAMERA: &str = "camera";
+}
