@@ -1,6 +1,7 @@
 //! The commands: one file each. Results go to stdout, diagnostics to stderr.
 
 pub mod check;
+pub mod evaluate;
 pub mod export;
 pub mod file_kind;
 pub mod import;
@@ -21,6 +22,7 @@ pub const BAD_ARGUMENTS: u8 = 2;
 #[derive(Debug, Subcommand)]
 pub enum Command {
     Import(import::Args),
+    Evaluate(evaluate::Args),
     Export(export::Args),
     Info(info::Args),
     Check(check::Args),
@@ -30,6 +32,7 @@ impl Command {
     pub fn run(&self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Import(args) => import::run(args),
+            Self::Evaluate(args) => evaluate::run(args),
             Self::Export(args) => export::run(args),
             Self::Info(args) => info::run(args),
             Self::Check(args) => check::run(args),

@@ -1,5 +1,6 @@
 //! Figures.
 
 mod metrics;
+pub mod protocol;
 
 pub use metrics::ErrorFigures;

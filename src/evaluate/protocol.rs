@@ -1,0 +1,249 @@
+//! The paper's protocol on one survey: split, learn, select, test.
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+
+use crate::gp::{GpError, LearningPositions};
+use crate::localize::{FieldOnCells, NoiseModel, most_likely_cell, refined_m};
+use crate::map::{CandidateCells, CellsError};
+use crate::train::{
+    LearnError, LearnedGroup, LikelihoodTable, Recipe, Selection, Split, Survey, backward_elimination,
+};
+use crate::types::PositionM;
+
+/// One way of carrying out the protocol.
+#[derive(Debug, Clone)]
+pub struct Trial<'a> {
+    pub recipe: &'a Recipe,
+    pub split: &'a Split,
+    pub grid_step_m: f64,
+    /// Positions to learn from and to select on, one a frame of the survey.
+    pub recorded_m: &'a [PositionM],
+}
+
+/// What a trial brought for one row of the table: a group, or all of them fused.
+#[derive(Debug, Clone)]
+pub struct Outcome {
+    /// Name of the descriptor, or `fused`.
+    pub features: String,
+    /// Properties, features after scaling, and features kept by the selection.
+    pub m: usize,
+    pub rank: usize,
+    pub kept: usize,
+    /// Estimates of the test frames, in the order of the split, with all features and with those kept.
+    pub all_test_m: Vec<PositionM>,
+    pub kept_test_m: Vec<PositionM>,
+    /// Estimates of the validation frames with the features kept.
+    pub kept_validation_m: Vec<PositionM>,
+    /// Bayesian information criterion with all features and with those kept; `None` where features have no likelihood of
+    /// their own.
+    pub bic_all: Option<f64>,
+    pub bic_kept: Option<f64>,
+    /// Fits with something to say, by what they say.
+    pub warnings: Vec<(crate::gp::fit::Warning, usize)>,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum ProtocolError {
+    #[error(transparent)]
+    Learn(#[from] LearnError),
+    #[error(transparent)]
+    Gp(#[from] GpError),
+    #[error(transparent)]
+    Cells(#[from] CellsError),
+    #[error("all {frames} learning images are at one place: there is nothing to localize")]
+    OnePlace { frames: usize },
+}
+
+/// What a trial is doing, for a progress display.
+#[derive(Debug, Clone, Copy)]
+pub enum Step {
+    /// So many features are about to be fitted to this descriptor.
+    Fitting { descriptor: &'static str, features: usize },
+    FeatureFitted,
+    Eliminating { features: usize },
+    FeatureEliminated,
+    Done,
+}
+
+/// Log-likelihoods of queries at every cell, query × cell, summed over groups.
+struct Likelihoods {
+    cells: usize,
+    values: Vec<f32>,
+}
+
+/// Runs `trial` on `survey`: one outcome a group, and one of all groups fused if there are several.
+pub fn run(survey: &Survey, trial: &Trial, on_step: impl Fn(Step) + Sync) -> Result<Vec<Outcome>, ProtocolError> {
+    let at = |rows: &[usize]| -> Vec<PositionM> { rows.iter().map(|&row| trial.recorded_m[row]).collect() };
+    let split = trial.split;
+    let learning = LearningPositions::new(at(&split.learning));
+    if learning.positions().windows(2).all(|pair| pair[0] == pair[1]) {
+        return Err(ProtocolError::OnePlace { frames: learning.len() });
+    }
+    let cells = CandidateCells::around(learning.positions(), trial.grid_step_m, None)?;
+    let centers_m = cells.centers_m();
+    let queries = Queries { survey, trial, validation_m: at(&split.validation) };
+    let estimate = |likelihoods: &Likelihoods| -> Vec<PositionM> {
+        likelihoods.values.chunks_exact(likelihoods.cells).map(|row| locate(&cells, row, trial.recipe.refine)).collect()
+    };
+
+    let mut outcomes = Vec::new();
+    let mut fused: Option<[Likelihoods; 3]> = None;
+    for group_recipe in &trial.recipe.groups {
+        let descriptor = group_recipe.descriptor;
+        on_step(Step::Fitting { descriptor: descriptor.name(), features: descriptor.dimensions() });
+        let group = LearnedGroup::learn(
+            *group_recipe,
+            &learning,
+            survey.properties(descriptor, &split.learning).as_ref(),
+            survey.changes(descriptor, &split.learning).as_ref(),
+            || on_step(Step::FeatureFitted),
+        )?;
+        let field = group.on_cells(&learning, &centers_m)?;
+        let kept = match trial.recipe.selection {
+            Selection::None => (0..group.features()).collect(),
+            Selection::Backward => queries.select(&group, &field, &centers_m, &on_step),
+        };
+        let kept_group = group.select(&kept);
+        let kept_field = kept_group.on_cells(&learning, &centers_m)?;
+        let all_test = queries.likelihoods(&group, &field, &split.test);
+        let kept_test = queries.likelihoods(&kept_group, &kept_field, &split.test);
+        let kept_validation = queries.likelihoods(&kept_group, &kept_field, &split.validation);
+        let everything: Vec<usize> = (0..group.features()).collect();
+        let bic = |kept: &[usize]| group.log_likelihood(kept).map(|l| bic(l, kept.len(), learning.len()));
+        outcomes.push(Outcome {
+            features: descriptor.name().to_owned(),
+            m: descriptor.dimensions(),
+            rank: group.rank,
+            kept: kept.len(),
+            all_test_m: estimate(&all_test),
+            kept_test_m: estimate(&kept_test),
+            kept_validation_m: estimate(&kept_validation),
+            bic_all: bic(&everything),
+            bic_kept: bic(&kept),
+            warnings: group.warnings(),
+        });
+        let weight = group_recipe.weight as f32;
+        match &mut fused {
+            None => fused = Some([all_test, kept_test, kept_validation].map(|likelihoods| likelihoods.scaled(weight))),
+            Some(sums) => {
+                for (sum, likelihoods) in sums.iter_mut().zip([all_test, kept_test, kept_validation]) {
+                    sum.add(&likelihoods, weight);
+                }
+            }
+        }
+        on_step(Step::Done);
+    }
+    if let (Some([all_test, kept_test, kept_validation]), true) = (fused, outcomes.len() > 1) {
+        let total = |of: fn(&Outcome) -> usize| outcomes.iter().map(of).sum();
+        let sum = |of: fn(&Outcome) -> Option<f64>| outcomes.iter().map(of).sum();
+        outcomes.push(Outcome {
+            features: "fused".into(),
+            m: total(|outcome| outcome.m),
+            rank: total(|outcome| outcome.rank),
+            kept: total(|outcome| outcome.kept),
+            all_test_m: estimate(&all_test),
+            kept_test_m: estimate(&kept_test),
+            kept_validation_m: estimate(&kept_validation),
+            bic_all: sum(|outcome| outcome.bic_all),
+            bic_kept: sum(|outcome| outcome.bic_kept),
+            warnings: Vec::new(),
+        });
+    }
+    Ok(outcomes)
+}
+
+/// −2 Σ L(θ_r) + 4 |Ω| log n: the reading of the Bayesian information criterion that fits the paper's tables, four
+/// hyperparameters a feature.
+fn bic(log_likelihood: f64, features: usize, learning: usize) -> f64 {
+    -2.0 * log_likelihood + 4.0 * features as f64 * (learning as f64).ln()
+}
+
+/// The position of greatest log-likelihood: the cell, or the summit next to it.
+pub fn locate(cells: &CandidateCells, log_likelihood: &[f32], refine: bool) -> PositionM {
+    let best = most_likely_cell(log_likelihood);
+    if refine { refined_m(cells, log_likelihood, best) } else { cells.center_m(best) }
+}
+
+/// The frames of a trial as queries.
+struct Queries<'a> {
+    survey: &'a Survey,
+    trial: &'a Trial<'a>,
+    validation_m: Vec<PositionM>,
+}
+
+impl Queries<'_> {
+    /// Backward elimination on the validation frames.
+    fn select(
+        &self,
+        group: &LearnedGroup,
+        field: &FieldOnCells,
+        centers_m: &[PositionM],
+        on_step: &(impl Fn(Step) + Sync),
+    ) -> Vec<usize> {
+        on_step(Step::Eliminating { features: group.features() });
+        let mut table = LikelihoodTable::new(group.features(), centers_m.to_vec());
+        let features = self.features(group, &self.trial.split.validation);
+        let rows: Vec<Vec<f32>> = features.par_iter().map(|row| field.log_likelihood_of_each(row)).collect();
+        for (row, &truth_m) in rows.into_iter().zip(&self.validation_m) {
+            table.push(truth_m, row);
+        }
+        backward_elimination(&table, |_| on_step(Step::FeatureEliminated)).best_subset()
+    }
+
+    fn likelihoods(&self, group: &LearnedGroup, field: &FieldOnCells, rows: &[usize]) -> Likelihoods {
+        let features = self.features(group, rows);
+        log_likelihoods(field, &features, group.recipe.noise)
+    }
+
+    /// Features of the frames at `rows`, one vector a frame.
+    fn features(&self, group: &LearnedGroup, rows: &[usize]) -> Vec<Vec<f32>> {
+        features_of(group, self.survey, rows)
+    }
+}
+
+fn features_of(group: &LearnedGroup, survey: &Survey, rows: &[usize]) -> Vec<Vec<f32>> {
+    let features = group.scaling.apply(survey.properties(group.recipe.descriptor, rows).as_ref());
+    (0..rows.len()).map(|i| (0..group.features()).map(|r| features[(i, r)] as f32).collect()).collect()
+}
+
+fn log_likelihoods(field: &FieldOnCells, features: &[Vec<f32>], noise: NoiseModel) -> Likelihoods {
+    let rows: Vec<Vec<f32>> = features
+        .par_iter()
+        .map_init(Vec::new, |scratch, features| {
+            let mut row = vec![0.0; field.cells()];
+            field.add_log_likelihood(features, noise, 1.0, scratch, &mut row);
+            row
+        })
+        .collect();
+    Likelihoods { cells: field.cells(), values: rows.concat() }
+}
+
+impl Likelihoods {
+    fn scaled(mut self, weight: f32) -> Self {
+        self.values.iter_mut().for_each(|value| *value *= weight);
+        self
+    }
+
+    fn add(&mut self, other: &Self, weight: f32) {
+        for (sum, value) in self.values.iter_mut().zip(&other.values) {
+            *sum += weight * value;
+        }
+    }
+}
+
+/// The paper's disturbance of all positions for its “(noisy)” rows: one foot on either axis.
+pub const NOISY_POSITION_STD_M: f64 = 0.3048;
+
+/// `positions_m` with seeded Gaussian noise of [`NOISY_POSITION_STD_M`].
+pub fn noisy(positions_m: &[PositionM], seed: u64) -> Vec<PositionM> {
+    use rand::Rng;
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    random.set_stream(1);
+    let mut normal = || {
+        let radius = (-2.0 * (1.0 - random.random::<f64>()).ln()).sqrt();
+        NOISY_POSITION_STD_M * radius * (std::f64::consts::TAU * random.random::<f64>()).cos()
+    };
+    positions_m.iter().map(|p| [p[0] + normal(), p[1] + normal()]).collect()
+}
