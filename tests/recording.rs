@@ -305,6 +305,32 @@ fn a_data_set_without_calibration_or_times_can_be_imported() {
     assert_eq!(text, format!("{HEADER}\n0,0000.jpg,1,2,,\n1,0001.jpg,1,2,,\n"), "no time is invented");
 }
 
+#[test]
+fn frames_without_huffman_tables_are_completed() {
+    let dataset = TinyDataset::new();
+    let whole = jpeg(96, 96, 3);
+    let mut bare = whole.clone();
+    while let Some(at) = bare.windows(2).position(|pair| pair == [0xFF, 0xC4]) {
+        let length = usize::from(u16::from_be_bytes([bare[at + 2], bare[at + 3]]));
+        bare.drain(at..at + 2 + length);
+    }
+    dataset.write("images/0003.jpg", &bare);
+    let (recording, images) = (dataset.import("a.mcap"), dataset.path("pictures"));
+    omniloc().arg("export").arg(&recording).args(["--to", "images", "--out"]).arg(&images).assert().success();
+    let decoded = image::open(images.join("0003.jpg")).expect("any program can decode it");
+    assert_eq!(decoded.to_luma8(), image::load_from_memory(&whole).expect("decodes").to_luma8());
+}
+
+#[test]
+fn a_reader_that_stops_early_is_no_error() {
+    let dataset = TinyDataset::new();
+    let recording = dataset.import("a.mcap");
+    let mut info = process::Command::new(env!("CARGO_BIN_EXE_omniloc"));
+    let mut info = info.arg("info").arg(&recording).stdout(process::Stdio::piped()).spawn().expect("starts");
+    drop(info.stdout.take());
+    assert_eq!(info.wait().expect("ends").code(), Some(0));
+}
+
 /// The recording as other people's programs see it. `tests/run` makes the Python environment and names it.
 #[test]
 fn python_reads_what_was_recorded() {

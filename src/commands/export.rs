@@ -7,6 +7,7 @@ use clap::ValueEnum;
 use super::{
     BadArgument, DONE,
     options::{OutputKind, check_output, parse_origin},
+    print,
 };
 use crate::{
     recording::{ExportError, Format, Recording, export},
@@ -69,6 +70,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if recording.images_without_pair > 0 {
         eprintln!("note: {} images are left out: no position is known for them", recording.images_without_pair);
     }
-    println!("{}: {} frames", args.out.display(), report.frames);
+    print(&format!("{}: {} frames\n", args.out.display(), report.frames))?;
     Ok(DONE.into())
 }

@@ -11,6 +11,7 @@ mod import;
 pub mod proto;
 mod reader;
 mod records;
+mod scan;
 pub mod topics;
 mod verify;
 mod writer;
