@@ -199,6 +199,15 @@ fn a_write_that_fails_midway_leaves_nothing() {
     assert_eq!(code, Some(1), "{stderr}");
     assert!(stderr.contains("out.mcap: cannot write") && stderr.contains("limit is reached"), "{stderr}");
     assert_eq!(names(dataset.temporary.path()), ["tiny"], "nothing is left behind");
+
+    let out = dataset.path("folder");
+    dataset.write("images/0000.jpg", &[jpeg(96, 96, 0), vec![0; 20_000]].concat());
+    let padded = dataset.import("padded.mcap");
+    let args: [&Path; 6] = ["export".as_ref(), &padded, "--to".as_ref(), "dataset".as_ref(), "--out".as_ref(), &out];
+    let (code, stderr) = limited(&args);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("folder/images/0000.jpg: cannot write"), "{stderr}");
+    assert_eq!(names(dataset.temporary.path()), ["padded.mcap", "tiny"], "nothing is left behind");
 }
 
 #[test]

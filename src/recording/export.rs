@@ -106,7 +106,7 @@ fn write_folder_atomically(out: &Path, fill: impl FnOnce(&Path) -> Result<(), Ex
     let temporary = builder.tempdir_in(parent).map_err(failed)?;
     let filled = temporary.path().join("new");
     fs::create_dir(&filled).map_err(failed)?;
-    fill(&filled)?;
+    fill(&filled).map_err(|error| with_final_name(error, &filled, out))?;
     sync_files(&filled).map_err(failed)?;
     if out.exists() {
         // A folder cannot be replaced in one step: move the old one aside, and back if the new one cannot take its place.
@@ -121,6 +121,17 @@ fn write_folder_atomically(out: &Path, fill: impl FnOnce(&Path) -> Result<(), Ex
     }
     sync_folder(parent);
     Ok(())
+}
+
+/// The error with the name the file was going to have.
+fn with_final_name(error: ExportError, temporary: &Path, out: &Path) -> ExportError {
+    match error {
+        ExportError::Recording(RecordingError::CannotWrite { path, cause }) => {
+            let path = path.strip_prefix(temporary).map(|inside| out.join(inside)).unwrap_or(path);
+            RecordingError::CannotWrite { path, cause }.into()
+        }
+        other => other,
+    }
 }
 
 /// Puts all files in a folder on the disk. At the end, not one by one: by then most are written, and it goes fast.
