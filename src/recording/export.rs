@@ -9,8 +9,9 @@ use std::{
 use serde_json::json;
 
 use super::{
-    dataset::{CALIBRATION_FILE, HEADER, IMAGES_FOLDER, POSITIONS_FILE, RECORDING_FILE, RecordingFacts, image_path},
+    dataset::{CALIBRATION_FILE, IMAGES_FOLDER, POSITIONS_FILE, RECORDING_FILE, RecordingFacts},
     error::RecordingError,
+    positions::{HEADER, image_path},
     reader::{Recording, SurveyFrame},
     writer::{folder_of, sync_folder, write_file_atomically},
 };

@@ -8,6 +8,7 @@ mod dataset;
 mod error;
 mod export;
 mod import;
+mod positions;
 pub mod proto;
 mod reader;
 mod records;
