@@ -145,7 +145,13 @@ fn bad_arguments_end_with_2() {
     let before = fs::read(&recording).expect("readable");
     let (folder, recording) = (dataset.folder(), recording.as_path());
     let gpx = dataset.path("a.gpx");
-    let table: [(&str, Vec<&Path>, &str); 6] = [
+    let table: [(&str, Vec<&Path>, &str); 8] = [
+        ("no file", vec!["check".as_ref(), "/nonexistent".as_ref()], "/nonexistent: no such file"),
+        (
+            "no recording",
+            vec!["export".as_ref(), "/none".as_ref(), "--to=csv".as_ref(), "--out".as_ref(), &gpx],
+            "/none",
+        ),
         ("exists", vec!["import".as_ref(), &folder, "--out".as_ref(), recording], "--force"),
         ("no data set", vec!["import".as_ref(), "/nonexistent".as_ref(), "--out".as_ref(), &gpx], "/nonexistent"),
         (
@@ -303,6 +309,7 @@ fn a_data_set_without_calibration_or_times_can_be_imported() {
         run(omniloc().arg("import").arg(dataset.folder()).arg("--without-calibration").arg("--out").arg(&out));
     assert_eq!(code, 0, "{stderr}");
     assert!(stderr.contains("warning") && stderr.contains("lines 3 and 2"), "repeated positions are named: {stderr}");
+    assert!(stderr.contains("3 images") && stderr.contains("0002.jpg"), "unused images are named: {stderr}");
     let (code, stdout, _) = run(omniloc().arg("check").arg(&out));
     assert!(code == 0 && stdout.contains("no calibration"), "{stdout}");
     let error = omniloc::recording::Recording::open(&out).expect_err("training needs a calibration");

@@ -8,6 +8,7 @@ use serde_json::json;
 use super::{
     DONE, FAILED,
     file_kind::{FileKind, file_kind},
+    options::check_input,
     print, printable,
 };
 use crate::recording::{Verdict, verify};
@@ -25,6 +26,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    check_input(&args.file)?;
     match file_kind(&args.file).with_context(|| format!("reading {}", args.file.display()))? {
         FileKind::Map => anyhow::bail!("{}: maps are not supported yet", args.file.display()),
         FileKind::Recording => {}

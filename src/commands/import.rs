@@ -4,7 +4,7 @@ use std::{path::PathBuf, process::ExitCode};
 
 use super::{
     BadArgument, DONE,
-    options::{OutputKind, check_output, parse_origin},
+    options::{OutputKind, check_input, check_output, parse_origin},
     print,
 };
 use crate::{
@@ -38,6 +38,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    args.calibration.as_deref().map_or(Ok(()), check_input)?;
     check_output(&args.out, OutputKind::File, args.force)?;
     let calibration = match (&args.calibration, args.without_calibration) {
         (Some(file), _) => CalibrationSource::File(file.clone()),

@@ -50,10 +50,16 @@ impl Verdict {
 /// Checks CRCs, indexes against contents, every message, every image's outline, pairs against images, calibration.
 ///
 /// # Errors
-/// Only if the file cannot be read or is no MCAP file at all; damage is in the verdict.
+/// Only if the file cannot be read; damage is in the verdict.
 pub fn verify(path: &Path) -> Result<Verdict, RecordingError> {
-    let mut file = RecordFile::open(path)?;
     let mut check = Check::default();
+    let mut file = match RecordFile::open(path) {
+        Err(error @ RecordingError::NotMcap { .. }) => {
+            check.verdict.problem(error.to_string());
+            return Ok(check.verdict);
+        }
+        outcome => outcome?,
+    };
     loop {
         match file.next() {
             Ok(Some(record)) => check.read_top_record(record.opcode, record.offset, record.body, record.section_fault),
