@@ -145,7 +145,13 @@ fn bad_arguments_end_with_2() {
     let before = fs::read(&recording).expect("readable");
     let (folder, recording) = (dataset.folder(), recording.as_path());
     let gpx = dataset.path("a.gpx");
-    let table: [(&str, Vec<&Path>, &str); 6] = [
+    let table: [(&str, Vec<&Path>, &str); 8] = [
+        ("no file", vec!["check".as_ref(), "/nonexistent".as_ref()], "/nonexistent: no such file"),
+        (
+            "no recording",
+            vec!["export".as_ref(), "/none".as_ref(), "--to=csv".as_ref(), "--out".as_ref(), &gpx],
+            "/none",
+        ),
         ("exists", vec!["import".as_ref(), &folder, "--out".as_ref(), recording], "--force"),
         ("no data set", vec!["import".as_ref(), "/nonexistent".as_ref(), "--out".as_ref(), &gpx], "/nonexistent"),
         (
@@ -199,6 +205,15 @@ fn a_write_that_fails_midway_leaves_nothing() {
     assert_eq!(code, Some(1), "{stderr}");
     assert!(stderr.contains("out.mcap: cannot write") && stderr.contains("limit is reached"), "{stderr}");
     assert_eq!(names(dataset.temporary.path()), ["tiny"], "nothing is left behind");
+
+    let out = dataset.path("folder");
+    dataset.write("images/0000.jpg", &[jpeg(96, 96, 0), vec![0; 20_000]].concat());
+    let padded = dataset.import("padded.mcap");
+    let args: [&Path; 6] = ["export".as_ref(), &padded, "--to".as_ref(), "dataset".as_ref(), "--out".as_ref(), &out];
+    let (code, stderr) = limited(&args);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("folder/images/0000.jpg: cannot write"), "{stderr}");
+    assert_eq!(names(dataset.temporary.path()), ["padded.mcap", "tiny"], "nothing is left behind");
 }
 
 #[test]
@@ -294,6 +309,7 @@ fn a_data_set_without_calibration_or_times_can_be_imported() {
         run(omniloc().arg("import").arg(dataset.folder()).arg("--without-calibration").arg("--out").arg(&out));
     assert_eq!(code, 0, "{stderr}");
     assert!(stderr.contains("warning") && stderr.contains("lines 3 and 2"), "repeated positions are named: {stderr}");
+    assert!(stderr.contains("3 images") && stderr.contains("0002.jpg"), "unused images are named: {stderr}");
     let (code, stdout, _) = run(omniloc().arg("check").arg(&out));
     assert!(code == 0 && stdout.contains("no calibration"), "{stdout}");
     let error = omniloc::recording::Recording::open(&out).expect_err("training needs a calibration");
@@ -303,6 +319,32 @@ fn a_data_set_without_calibration_or_times_can_be_imported() {
     omniloc().arg("export").arg(&out).args(["--to", "dataset", "--out"]).arg(&exported).assert().success();
     let text = fs::read_to_string(exported.join("positions.csv")).expect("readable");
     assert_eq!(text, format!("{HEADER}\n0,0000.jpg,1,2,,\n1,0001.jpg,1,2,,\n"), "no time is invented");
+}
+
+#[test]
+fn frames_without_huffman_tables_are_completed() {
+    let dataset = TinyDataset::new();
+    let whole = jpeg(96, 96, 3);
+    let mut bare = whole.clone();
+    while let Some(at) = bare.windows(2).position(|pair| pair == [0xFF, 0xC4]) {
+        let length = usize::from(u16::from_be_bytes([bare[at + 2], bare[at + 3]]));
+        bare.drain(at..at + 2 + length);
+    }
+    dataset.write("images/0003.jpg", &bare);
+    let (recording, images) = (dataset.import("a.mcap"), dataset.path("pictures"));
+    omniloc().arg("export").arg(&recording).args(["--to", "images", "--out"]).arg(&images).assert().success();
+    let decoded = image::open(images.join("0003.jpg")).expect("any program can decode it");
+    assert_eq!(decoded.to_luma8(), image::load_from_memory(&whole).expect("decodes").to_luma8());
+}
+
+#[test]
+fn a_reader_that_stops_early_is_no_error() {
+    let dataset = TinyDataset::new();
+    let recording = dataset.import("a.mcap");
+    let mut info = process::Command::new(env!("CARGO_BIN_EXE_omniloc"));
+    let mut info = info.arg("info").arg(&recording).stdout(process::Stdio::piped()).spawn().expect("starts");
+    drop(info.stdout.take());
+    assert_eq!(info.wait().expect("ends").code(), Some(0));
 }
 
 /// The recording as other people's programs see it. `tests/run` makes the Python environment and names it.

@@ -8,8 +8,10 @@ use serde_json::json;
 use super::{
     DONE, FAILED,
     file_kind::{FileKind, file_kind},
+    options::check_input,
+    print, printable,
 };
-use crate::recording::verify;
+use crate::recording::{Verdict, verify};
 
 /// Check every byte of a recording or map
 ///
@@ -24,38 +26,40 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    check_input(&args.file)?;
     match file_kind(&args.file).with_context(|| format!("reading {}", args.file.display()))? {
         FileKind::Map => anyhow::bail!("{}: maps are not supported yet", args.file.display()),
         FileKind::Recording => {}
     }
     let verdict = verify(&args.file)?;
     let sound = verdict.is_sound();
-    if args.json {
-        let report = json!({
-            "file": args.file, "kind": "recording", "sound": sound, "problems": verdict.problems,
-            "unlisted_problems": verdict.unlisted_problems, "notes": verdict.notes, "chunks": verdict.chunks,
-            "messages": verdict.messages, "images": verdict.images, "pairs": verdict.pairs,
-        });
-        println!("{report:#}");
-    } else {
-        for problem in &verdict.problems {
-            println!("problem: {problem}");
-        }
-        if verdict.unlisted_problems > 0 {
-            println!("problem: and {} more", verdict.unlisted_problems);
-        }
-        for note in &verdict.notes {
-            println!("note: {note}");
-        }
-        println!(
-            "{}: {}: {} chunks, {} messages, {} images, {} pairs",
-            args.file.display(),
-            if sound { "sound" } else { "NOT SOUND" },
-            verdict.chunks,
-            verdict.messages,
-            verdict.images,
-            verdict.pairs
-        );
-    }
+    print(&if args.json { as_json(args, &verdict) } else { as_text(args, &verdict) })?;
     Ok(if sound { DONE } else { FAILED }.into())
+}
+
+fn as_json(args: &Args, verdict: &Verdict) -> String {
+    let report = json!({
+        "file": args.file, "kind": "recording", "sound": verdict.is_sound(), "problems": verdict.problems,
+        "unlisted_problems": verdict.unlisted_problems, "notes": verdict.notes, "chunks": verdict.chunks,
+        "messages": verdict.messages, "images": verdict.images, "pairs": verdict.pairs,
+    });
+    format!("{report:#}\n")
+}
+
+fn as_text(args: &Args, verdict: &Verdict) -> String {
+    let mut lines: Vec<String> = verdict.problems.iter().map(|problem| format!("problem: {problem}")).collect();
+    if verdict.unlisted_problems > 0 {
+        lines.push(format!("problem: and {} more", verdict.unlisted_problems));
+    }
+    lines.extend(verdict.notes.iter().map(|note| format!("note: {note}")));
+    lines.push(format!(
+        "{}: {}: {} chunks, {} messages, {} images, {} pairs",
+        args.file.display(),
+        if verdict.is_sound() { "sound" } else { "NOT SOUND" },
+        verdict.chunks,
+        verdict.messages,
+        verdict.images,
+        verdict.pairs
+    ));
+    lines.iter().map(|line| printable(line) + "\n").collect()
 }

@@ -6,7 +6,8 @@ use clap::ValueEnum;
 
 use super::{
     BadArgument, DONE,
-    options::{OutputKind, check_output, parse_origin},
+    options::{OutputKind, check_input, check_output, parse_origin},
+    print,
 };
 use crate::{
     recording::{ExportError, Format, Recording, export},
@@ -49,6 +50,7 @@ pub enum To {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    check_input(&args.recording)?;
     let (format, kind) = match args.to {
         To::Dataset => (Format::Dataset, OutputKind::Folder),
         To::Csv => (Format::Csv, OutputKind::File),
@@ -69,6 +71,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if recording.images_without_pair > 0 {
         eprintln!("note: {} images are left out: no position is known for them", recording.images_without_pair);
     }
-    println!("{}: {} frames", args.out.display(), report.frames);
+    print(&format!("{}: {} frames\n", args.out.display(), report.frames))?;
     Ok(DONE.into())
 }

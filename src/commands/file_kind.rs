@@ -24,3 +24,25 @@ pub fn file_kind(path: &Path) -> io::Result<FileKind> {
         _ => FileKind::Recording,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn content_decides_before_the_name() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        for (name, bytes, expected) in [
+            ("a.map", mcap::MAGIC, FileKind::Recording),
+            ("a.mcap", b"\x10\0\0\0\0\0\0\0{}".as_slice(), FileKind::Map),
+            ("b.map", b"".as_slice(), FileKind::Map),
+            ("b.mcap", b"".as_slice(), FileKind::Recording),
+        ] {
+            let path = folder.path().join(name);
+            fs::write(&path, bytes).expect("writes");
+            assert_eq!(file_kind(&path).expect("readable"), expected, "{name}");
+        }
+    }
+}

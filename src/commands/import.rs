@@ -4,7 +4,8 @@ use std::{path::PathBuf, process::ExitCode};
 
 use super::{
     BadArgument, DONE,
-    options::{OutputKind, check_output, parse_origin},
+    options::{OutputKind, check_input, check_output, parse_origin},
+    print,
 };
 use crate::{
     recording::{CalibrationSource, ImportSettings, import},
@@ -37,6 +38,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    args.calibration.as_deref().map_or(Ok(()), check_input)?;
     check_output(&args.out, OutputKind::File, args.force)?;
     let calibration = match (&args.calibration, args.without_calibration) {
         (Some(file), _) => CalibrationSource::File(file.clone()),
@@ -54,6 +56,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         eprintln!("note: {} frames came without Huffman tables; the standard ones were added", report.completed_frames);
     }
     let (width_px, height_px) = report.image_size_px;
-    println!("{}: {} frames of {width_px} x {height_px} px from {}", args.out.display(), report.frames, report.name);
+    print(&format!(
+        "{}: {} frames of {width_px} x {height_px} px from {}\n",
+        args.out.display(),
+        report.frames,
+        report.name
+    ))?;
     Ok(DONE.into())
 }

@@ -8,8 +8,10 @@ use serde_json::json;
 use super::{
     DONE,
     file_kind::{FileKind, file_kind},
+    options::check_input,
+    print, printable,
 };
-use crate::recording::{Recording, TopicSummary};
+use crate::recording::{Recording, RecordingError, TopicSummary};
 
 /// Show what is in a recording or map
 #[derive(Debug, clap::Args)]
@@ -22,6 +24,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    check_input(&args.file)?;
     match file_kind(&args.file).with_context(|| format!("reading {}", args.file.display()))? {
         FileKind::Map => anyhow::bail!("{}: maps are not supported yet", args.file.display()),
         FileKind::Recording => {}
@@ -29,9 +32,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let recording = Recording::open_any(&args.file)?;
     let size_bytes = fs::metadata(&args.file).map(|facts| facts.len()).unwrap_or_default();
     if args.json {
-        println!("{:#}", as_json(&recording, size_bytes));
+        print(&format!("{:#}\n", as_json(&recording, size_bytes)))?;
     } else {
-        print!("{}", as_text(&recording, size_bytes));
+        print(&as_text(&recording, size_bytes))?;
     }
     Ok(DONE.into())
 }
@@ -140,7 +143,8 @@ fn as_text(recording: &Recording, size_bytes: u64) -> String {
                 "donut, centre ({}, {}), radii {} .. {} px",
                 donut.center_x_px, donut.center_y_px, donut.inner_radius_px, donut.outer_radius_px
             ),
-            Err(_) => "none: run `omniloc calibrate`".into(),
+            Err(RecordingError::NoCalibration { .. }) => "none: run `omniloc calibrate`".into(),
+            Err(error) => format!("{:#}", anyhow::Error::new(error)),
         },
     );
     let mut text: String = lines.iter().map(|(label, text)| format!("{label:<15}{text}\n")).collect();
@@ -160,9 +164,4 @@ fn as_text(recording: &Recording, size_bytes: u64) -> String {
         }
     }
     text
-}
-
-/// Text from a file must not steer the terminal.
-fn printable(text: &str) -> String {
-    text.chars().map(|character| if character.is_control() { '\u{FFFD}' } else { character }).collect()
 }

@@ -18,6 +18,14 @@ pub fn parse_origin(text: &str) -> Result<Geodetic, String> {
     if origin.is_plausible() { Ok(origin) } else { Err(expected.into()) }
 }
 
+/// Refuses an input that is not there.
+pub fn check_input(path: &Path) -> Result<(), BadArgument> {
+    match path.try_exists() {
+        Ok(false) => Err(BadArgument(format!("{}: no such file or folder", path.display()))),
+        _ => Ok(()),
+    }
+}
+
 /// What an output must be for `--force` to replace it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OutputKind {

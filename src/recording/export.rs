@@ -9,8 +9,9 @@ use std::{
 use serde_json::json;
 
 use super::{
-    dataset::{CALIBRATION_FILE, HEADER, IMAGES_FOLDER, POSITIONS_FILE, RECORDING_FILE, RecordingFacts, image_path},
+    dataset::{CALIBRATION_FILE, IMAGES_FOLDER, POSITIONS_FILE, RECORDING_FILE, RecordingFacts},
     error::RecordingError,
+    positions::{HEADER, image_path},
     reader::{Recording, SurveyFrame},
     writer::{folder_of, sync_folder, write_file_atomically},
 };
@@ -106,7 +107,8 @@ fn write_folder_atomically(out: &Path, fill: impl FnOnce(&Path) -> Result<(), Ex
     let temporary = builder.tempdir_in(parent).map_err(failed)?;
     let filled = temporary.path().join("new");
     fs::create_dir(&filled).map_err(failed)?;
-    fill(&filled)?;
+    fill(&filled).map_err(|error| with_final_name(error, &filled, out))?;
+    sync_files(&filled).map_err(failed)?;
     if out.exists() {
         // A folder cannot be replaced in one step: move the old one aside, and back if the new one cannot take its place.
         let old = temporary.path().join("old");
@@ -119,6 +121,31 @@ fn write_folder_atomically(out: &Path, fill: impl FnOnce(&Path) -> Result<(), Ex
         fs::rename(&filled, out).map_err(failed)?;
     }
     sync_folder(parent);
+    Ok(())
+}
+
+/// The error with the name the file was going to have.
+fn with_final_name(error: ExportError, temporary: &Path, out: &Path) -> ExportError {
+    match error {
+        ExportError::Recording(RecordingError::CannotWrite { path, cause }) => {
+            let path = path.strip_prefix(temporary).map(|inside| out.join(inside)).unwrap_or(path);
+            RecordingError::CannotWrite { path, cause }.into()
+        }
+        other => other,
+    }
+}
+
+/// Puts all files in a folder on the disk. At the end, not one by one: by then most are written, and it goes fast.
+fn sync_files(folder: &Path) -> io::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        if entry.file_type()?.is_dir() {
+            sync_files(&entry.path())?;
+        } else {
+            fs::File::open(entry.path())?.sync_all()?;
+        }
+    }
+    sync_folder(folder);
     Ok(())
 }
 
@@ -157,7 +184,7 @@ fn write_images(recording: &Recording, folder: &Path) -> Result<(), ExportError>
             io::ErrorKind::AlreadyExists => bad_name(),
             _ => failed(&path, cause).into(),
         })?;
-        let written = image.write_all(jpeg).and_then(|()| image.sync_all());
+        let written = image.write_all(jpeg);
         written.map_err(|cause| failed(&path, cause).into())
     })
 }
@@ -347,7 +374,7 @@ mod tests {
 
     #[test]
     fn numbers_read_back_as_they_were() {
-        for number in [0.01567, 0.1 + 0.2, -0.0, 1e-300, 123456789.123456789, 7.5] {
+        for number in [0.01567, 0.1 + 0.2, -0.0, 1e-300, 123456789.12345679, 7.5] {
             let text = shortest(Some(number));
             assert_eq!(text.parse::<f64>().map(f64::to_bits), Ok(number.to_bits()), "{text}");
         }

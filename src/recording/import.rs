@@ -8,8 +8,9 @@ use std::{
 };
 
 use super::{
-    dataset::{CALIBRATION_FILE, Dataset, DatasetError, IMAGES_FOLDER, Row},
+    dataset::{CALIBRATION_FILE, Dataset, DatasetError, IMAGES_FOLDER},
     error::RecordingError,
+    positions::Row,
     proto::{foxglove, omniloc},
     topics::{self, metadata},
     writer::{RecordingWriter, timestamp, write_file_atomically},

@@ -1,23 +1,21 @@
 //! Reads recordings, one chunk at a time: a drive may be larger than the memory.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, VecDeque},
+    collections::{BTreeMap, VecDeque},
     path::{Path, PathBuf},
 };
 
-use mcap::records::{MessageHeader, Record, op};
+use mcap::records::{MessageHeader, op};
 use prost::Message;
 
 use super::{
     error::RecordingError,
-    proto::{foxglove, omniloc},
-    records::{ChannelFacts, Channels, RecordFile, parse, visit_chunk},
-    topics::{self, metadata},
+    proto::foxglove,
+    records::{ChannelFacts, Channels, RecordFile, visit_chunk},
+    scan::{Scan, parse_calibration},
+    topics,
 };
-use crate::{
-    jpeg,
-    types::{DonutCalibration, Geodetic, PositionM},
-};
+use crate::types::{DonutCalibration, Geodetic, PositionM};
 
 /// What is known of the place one frame was taken at.
 #[derive(Debug, Clone, PartialEq)]
@@ -73,7 +71,6 @@ pub struct Recording {
     pub image_size_px: Option<(usize, usize)>,
     /// The attachment `donut.json` as it was written.
     pub(super) calibration_json: Option<Vec<u8>>,
-    calibration: Option<DonutCalibration>,
 }
 
 impl Recording {
@@ -96,7 +93,7 @@ impl Recording {
         Ok(recording)
     }
 
-    /// Opens a recording that may lack its calibration or its positions, to look at it or to calibrate on it.
+    /// Opens a recording whose calibration or positions may be missing or wrong, to look at it or to calibrate on it.
     pub fn open_any(path: &Path) -> Result<Self, RecordingError> {
         let mut scan = Scan::default();
         let mut file = RecordFile::open(path)?;
@@ -108,12 +105,13 @@ impl Recording {
             let offset = record.offset;
             outcome.map_err(|what| RecordingError::Damaged { path: path.into(), offset, what })?;
         }
-        scan.into_recording(path)
+        Ok(scan.into_recording(path))
     }
 
     /// Where the donut lies in the images.
-    pub fn calibration(&self) -> Result<&DonutCalibration, RecordingError> {
-        self.calibration.as_ref().ok_or_else(|| RecordingError::NoCalibration { path: self.path.clone() })
+    pub fn calibration(&self) -> Result<DonutCalibration, RecordingError> {
+        let missing = || RecordingError::NoCalibration { path: self.path.clone() };
+        parse_calibration(&self.path, self.calibration_json.as_ref().ok_or_else(missing)?, self.image_size_px)
     }
 
     /// The usable frames with their images, in the order of [`survey`](Self::survey); reads the file again.
@@ -191,10 +189,10 @@ impl Frames {
         let offset = record.offset;
         let mut read = |opcode: u8, body: &[u8]| {
             channels.read_record(opcode, body, |channel, header, data| {
-                if is_topic(channel, &topics::CAMERA_IMAGE) {
-                    if let Some(frame) = waiting.remove(&header.sequence) {
-                        ready.push_back((frame, decode_image(header, data)?));
-                    }
+                if is_topic(channel, &topics::CAMERA_IMAGE)
+                    && let Some(frame) = waiting.remove(&header.sequence)
+                {
+                    ready.push_back((frame, decode_image(header, data)?));
                 }
                 Ok(())
             })
@@ -230,171 +228,98 @@ pub(super) fn is_topic(channel: &ChannelFacts, topic: &topics::Topic) -> bool {
     channel.topic == topic.name && channel.schema_name == topic.schema_name && channel.encoding == "protobuf"
 }
 
-fn decode_image(header: &MessageHeader, data: &[u8]) -> Result<Vec<u8>, String> {
+pub(super) fn decode_image(header: &MessageHeader, data: &[u8]) -> Result<Vec<u8>, String> {
     let image = foxglove::CompressedImage::decode(data)
         .map_err(|error| format!("image {} cannot be decoded: {error}", header.sequence))?;
     Ok(image.data)
 }
 
-/// What one pass over the file gathers.
-#[derive(Default)]
-struct Scan {
-    channels: Channels,
-    topics: BTreeMap<String, TopicSummary>,
-    metadata: BTreeMap<String, BTreeMap<String, String>>,
-    calibration_json: Option<Vec<u8>>,
-    image_size_px: Option<(usize, usize)>,
-    /// Frame numbers in the order of the file.
-    images: Vec<u32>,
-    pairs: BTreeMap<u32, (SurveyFrame, Option<String>)>,
-}
+#[cfg(test)]
+mod tests {
+    use std::{fs, io::Cursor};
 
-impl Scan {
-    fn read_top_record(&mut self, opcode: u8, body: &[u8]) -> Result<(), String> {
-        match opcode {
-            op::CHUNK => visit_chunk(body, |opcode, body| self.read_record(opcode, body)),
-            op::METADATA => {
-                if let Record::Metadata(record) = parse(opcode, body)? {
-                    self.metadata.entry(record.name).or_default().extend(record.metadata);
-                }
-                Ok(())
-            }
-            op::ATTACHMENT => {
-                if let Record::Attachment { header, data, .. } = parse(opcode, body)? {
-                    if header.name == topics::CALIBRATION_ATTACHMENT {
-                        self.calibration_json = Some(data.into_owned());
-                    }
-                }
-                Ok(())
-            }
-            _ => self.read_record(opcode, body),
+    use super::*;
+    use crate::recording::{RecordingWriter, proto::omniloc};
+
+    const DONUT: &str = r#"{"kind": "donut", "cx": 15.5, "cy": 15.5, "r_in": 3.0, "r_out": 15.0, "top_is_outer": true,
+        "start_angle": 0.0, "clockwise": true, "azimuth": "ccw"}"#;
+
+    /// Frame, east \[m\], valid.
+    type Pair = (u32, f64, bool);
+
+    fn picture(value: u8) -> Vec<u8> {
+        let mut jpeg = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new(&mut jpeg)
+            .encode(&[value; 32 * 32], 32, 32, image::ExtendedColorType::L8)
+            .expect("encodes");
+        jpeg
+    }
+
+    fn pair(east_m: f64, valid: bool) -> omniloc::SurveyPair {
+        let invalid_reason = if valid { "" } else { "no fix for 3 s" };
+        omniloc::SurveyPair { east_m, valid, invalid_reason: invalid_reason.into(), ..Default::default() }
+    }
+
+    /// A recording as a drive makes it: some frames without a position, pairs later than their images.
+    fn write_drive(path: &Path, calibration: Option<&str>, pairs: &[Pair]) {
+        let mut recording = RecordingWriter::new(Cursor::new(Vec::new())).expect("starts");
+        if let Some(json) = calibration {
+            recording.attach("donut.json", "application/json", 0, json.as_bytes()).expect("attaches");
         }
+        for frame in 1..=4 {
+            recording.write_image(frame, frame.into(), picture(frame as u8)).expect("writes");
+            recording.flush().expect("flushes");
+        }
+        for &(frame, east_m, valid) in pairs {
+            recording.write_pair(frame, frame.into(), pair(east_m, valid)).expect("writes");
+        }
+        fs::write(path, recording.finish().expect("finishes").into_inner()).expect("writes");
     }
 
-    fn read_record(&mut self, opcode: u8, body: &[u8]) -> Result<(), String> {
-        let Self { channels, topics, image_size_px, images, pairs, .. } = self;
-        channels.read_record(opcode, body, |channel, header, data| {
-            count(topics, channel, header);
-            if is_topic(channel, &topics::CAMERA_IMAGE) {
-                images.push(header.sequence);
-                if image_size_px.is_none() {
-                    let info = jpeg::scan(&decode_image(header, data)?);
-                    *image_size_px = info.ok().map(|info| (info.width_px, info.height_px));
-                }
-            } else if is_topic(channel, &topics::SURVEY_PAIR) {
-                let pair = omniloc::SurveyPair::decode(data)
-                    .map_err(|error| format!("survey pair cannot be decoded: {error}"))?;
-                let sequence = u32::try_from(pair.frame_sequence)
-                    .map_err(|_| format!("survey pair of frame {}, expected below 2^32", pair.frame_sequence))?;
-                pairs.entry(sequence).or_insert_with(|| survey_frame(sequence, header.publish_time, pair));
-            }
-            Ok(())
-        })
-    }
+    #[test]
+    fn only_frames_with_image_and_valid_pair_are_usable() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("drive.mcap");
+        write_drive(&path, Some(DONUT), &[(4, 40.0, true), (1, 10.0, true), (2, 20.0, false), (9, f64::NAN, true)]);
+        let recording = Recording::open(&path).expect("sound");
+        assert_eq!(recording.name, "drive");
+        assert_eq!(recording.survey.iter().map(|frame| frame.index).collect::<Vec<_>>(), [1, 4]);
+        let reasons: Vec<_> = recording.unusable.iter().map(|(frame, why)| (frame.index, why.as_str())).collect();
+        assert_eq!(reasons, [(2, "no fix for 3 s"), (9, "position or yaw is not a number")]);
+        assert_eq!(recording.images_without_pair, 1, "frame 3");
 
-    fn into_recording(mut self, path: &Path) -> Result<Recording, RecordingError> {
-        let calibration = match &self.calibration_json {
-            None => None,
-            Some(json) => Some(parse_calibration(path, json, self.image_size_px)?),
+        let frames: Vec<_> = recording.frames().expect("opens").collect::<Result<_, _>>().expect("sound");
+        assert_eq!(
+            frames.iter().map(|(frame, _)| frame).collect::<Vec<_>>(),
+            recording.survey.iter().collect::<Vec<_>>()
+        );
+        assert_eq!(frames[1], (recording.survey[1].clone(), picture(4)));
+        let mut images = Vec::new();
+        let every_image = |sequence, stamp_ns, _: &[u8]| {
+            images.push((sequence, stamp_ns));
+            sequence < 3
         };
-        let mut survey = Vec::new();
-        let mut unusable = Vec::new();
-        let mut images_without_pair = 0;
-        let mut seen = BTreeSet::new();
-        for image in &self.images {
-            if !seen.insert(*image) {
-                continue;
-            }
-            match self.pairs.remove(image) {
-                Some((frame, None)) => survey.push(frame),
-                Some((frame, Some(reason))) => unusable.push((frame, reason)),
-                None => images_without_pair += 1,
-            }
-        }
-        let imageless =
-            |(frame, reason): (SurveyFrame, Option<String>)| (frame, reason.unwrap_or_else(|| "no image".into()));
-        unusable.extend(std::mem::take(&mut self.pairs).into_values().map(imageless));
-        unusable.sort_by_key(|(frame, _)| frame.index);
-
-        let stated_name = self.metadata.get(metadata::SOURCE).and_then(|source| source.get("name")).cloned();
-        let file_name = || path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(Recording {
-            path: path.into(),
-            name: stated_name.unwrap_or_else(file_name),
-            origin: self.metadata.get(metadata::ORIGIN).and_then(origin_from_metadata),
-            metadata: self.metadata,
-            survey,
-            unusable,
-            images_without_pair,
-            topics: self.topics,
-            image_size_px: self.image_size_px,
-            calibration_json: self.calibration_json,
-            calibration,
-        })
+        Recording::for_each_image(&path, every_image).expect("sound");
+        assert_eq!(images, [(1, 1), (2, 2), (3, 3)], "stops when told to");
     }
-}
 
-pub(super) fn count(topics: &mut BTreeMap<String, TopicSummary>, channel: &ChannelFacts, header: &MessageHeader) {
-    let stamp_ns = header.log_time;
-    let new = || TopicSummary {
-        schema_name: channel.schema_name.clone(),
-        messages: 0,
-        first_ns: stamp_ns,
-        last_ns: stamp_ns,
-    };
-    let summary = topics.entry(channel.topic.clone()).or_insert_with(new);
-    summary.messages += 1;
-    summary.first_ns = summary.first_ns.min(stamp_ns);
-    summary.last_ns = summary.last_ns.max(stamp_ns);
-}
-
-/// The calibration in an attachment, checked against the size of the images if that is known.
-pub(super) fn parse_calibration(
-    path: &Path,
-    json: &[u8],
-    image_size_px: Option<(usize, usize)>,
-) -> Result<DonutCalibration, RecordingError> {
-    let calibration: DonutCalibration = serde_json::from_slice(json)
-        .map_err(|error| RecordingError::UnreadableCalibration { path: path.into(), what: error.to_string() })?;
-    let checked = match image_size_px {
-        Some((width_px, height_px)) => calibration.check_in_image(width_px, height_px),
-        None => calibration.check(),
-    };
-    checked.map_err(|source| RecordingError::BadCalibration { path: path.into(), source })?;
-    Ok(calibration)
-}
-
-pub(super) fn origin_from_metadata(entries: &BTreeMap<String, String>) -> Option<Geodetic> {
-    let number = |key: &str| entries.get(key)?.parse::<f64>().ok();
-    let origin = Geodetic {
-        latitude_deg: number("latitude_deg")?,
-        longitude_deg: number("longitude_deg")?,
-        altitude_m: number("altitude_m")?,
-    };
-    origin.is_plausible().then_some(origin)
-}
-
-/// The frame of a pair, and why it must not be used.
-fn survey_frame(sequence: u32, stamp_ns: u64, pair: omniloc::SurveyPair) -> (SurveyFrame, Option<String>) {
-    let finite = pair.east_m.is_finite() && pair.north_m.is_finite() && pair.yaw_rad.is_none_or(f64::is_finite);
-    let reason = match (pair.valid, finite) {
-        (true, true) => None,
-        (true, false) => Some("position or yaw is not a number".into()),
-        (false, _) if pair.invalid_reason.is_empty() => Some("marked invalid without a reason".into()),
-        (false, _) => Some(pair.invalid_reason),
-    };
-    let frame = SurveyFrame {
-        index: sequence as usize,
-        source_file: pair.source_file,
-        stamp_ns,
-        position_m: [pair.east_m, pair.north_m],
-        yaw_rad: pair.yaw_rad,
-        position_std_m: pair.position_std_m,
-        interpolation_gap_s: pair.interpolation_gap_s,
-        interpolation_gap_m: pair.interpolation_gap_m,
-        serial_latency_s: pair.serial_latency_s,
-        serial_latency_m: pair.serial_latency_m,
-        time_s: pair.dataset_time_s,
-    };
-    (frame, reason)
+    #[test]
+    fn what_training_cannot_do_without_is_demanded() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("drive.mcap");
+        let outside = DONUT.replace("15.0", "25.0");
+        let good: &[Pair] = &[(1, 10.0, true)];
+        let table: [(Option<&str>, &[Pair], &str); 4] = [
+            (None, good, "no calibration"),
+            (Some(&outside), good, "bad calibration"),
+            (Some("{}"), good, "bad calibration"),
+            (Some(DONUT), &[(1, 0.0, false)], "4 images and 1 survey pairs of which 0"),
+        ];
+        for (calibration, pairs, expected) in table {
+            write_drive(&path, calibration, pairs);
+            let message = Recording::open(&path).expect_err(expected).to_string();
+            assert!(message.contains(expected) && message.contains("drive.mcap"), "{message}");
+            assert!(Recording::open_any(&path).is_ok(), "it can still be looked at");
+        }
+    }
 }

@@ -11,8 +11,9 @@ use prost::Message;
 use super::{
     error::RecordingError,
     proto::{foxglove, omniloc},
-    reader::{TopicSummary, count, is_topic, parse_calibration},
+    reader::{TopicSummary, is_topic},
     records::{ChannelFacts, Channels, RecordFile, parse, visit_chunk},
+    scan::{count, parse_calibration},
     topics,
 };
 use crate::jpeg;
@@ -49,10 +50,16 @@ impl Verdict {
 /// Checks CRCs, indexes against contents, every message, every image's outline, pairs against images, calibration.
 ///
 /// # Errors
-/// Only if the file cannot be read or is no MCAP file at all; damage is in the verdict.
+/// Only if the file cannot be read; damage is in the verdict.
 pub fn verify(path: &Path) -> Result<Verdict, RecordingError> {
-    let mut file = RecordFile::open(path)?;
     let mut check = Check::default();
+    let mut file = match RecordFile::open(path) {
+        Err(error @ RecordingError::NotMcap { .. }) => {
+            check.verdict.problem(error.to_string());
+            return Ok(check.verdict);
+        }
+        outcome => outcome?,
+    };
     loop {
         match file.next() {
             Ok(Some(record)) => check.read_top_record(record.opcode, record.offset, record.body, record.section_fault),
@@ -78,8 +85,12 @@ struct Check {
     /// Offset of each chunk → earliest and latest log time in it.
     chunks: BTreeMap<u64, Option<(u64, u64)>>,
     indexed_chunks: BTreeSet<u64>,
-    attachments: u32,
-    metadata: u32,
+    /// Offsets of the records that the summary has an index for, as found and as indexed.
+    attachments: BTreeSet<u64>,
+    metadata: BTreeSet<u64>,
+    indexed_attachments: BTreeSet<u64>,
+    indexed_metadata: BTreeSet<u64>,
+    indexed_messages: u64,
     statistics: Option<Statistics>,
     calibration_json: Option<Vec<u8>>,
     image_size_px: Option<(usize, usize)>,
@@ -103,12 +114,15 @@ impl Check {
         match parse(opcode, body) {
             Err(fault) => self.verdict.problem(format!("byte {offset}: {fault}")),
             Ok(Record::Attachment { header, data, .. }) => {
-                self.attachments += 1;
+                self.attachments.insert(offset);
                 if header.name == topics::CALIBRATION_ATTACHMENT {
                     self.calibration_json = Some(data.into_owned());
                 }
             }
-            Ok(Record::Metadata(_)) => self.metadata += 1,
+            Ok(Record::Metadata(_)) => drop(self.metadata.insert(offset)),
+            Ok(Record::AttachmentIndex(index)) => drop(self.indexed_attachments.insert(index.offset)),
+            Ok(Record::MetadataIndex(index)) => drop(self.indexed_metadata.insert(index.offset)),
+            Ok(Record::MessageIndex(index)) => self.indexed_messages += index.records.len() as u64,
             Ok(Record::Statistics(statistics)) => self.statistics = Some(statistics),
             Ok(Record::ChunkIndex(index)) => {
                 self.indexed_chunks.insert(index.chunk_start_offset);
@@ -198,12 +212,10 @@ impl Check {
         if !self.images.insert(sequence) {
             return Err(format!("image {sequence} is there twice"));
         }
-        if let Some((last, last_ns)) = self.last_image.replace((sequence, header.publish_time)) {
-            if sequence < last || header.publish_time < last_ns {
-                return Err(format!(
-                    "image {sequence} is before image {last} in number or time, but after it in the file"
-                ));
-            }
+        if let Some((last, last_ns)) = self.last_image.replace((sequence, header.publish_time))
+            && (sequence < last || header.publish_time < last_ns)
+        {
+            return Err(format!("image {sequence} is before image {last} in number or time, but after it in the file"));
         }
         let info = jpeg::scan(&image.data).map_err(|fault| format!("image {sequence}: {fault}"))?;
         let size_px = (info.width_px, info.height_px);
@@ -234,10 +246,7 @@ impl Check {
     fn finish(mut self, path: &Path) -> Verdict {
         if !self.was_cut {
             self.compare_with_statistics();
-            let unindexed = self.chunks.keys().filter(|offset| !self.indexed_chunks.contains(offset)).count();
-            if unindexed > 0 {
-                self.verdict.problem(format!("summary: {unindexed} chunks are missing from the index"));
-            }
+            self.compare_with_indexes();
         }
         let imageless = self.pairs.difference(&self.images).count();
         if imageless > 0 {
@@ -276,8 +285,8 @@ impl Check {
         let counts = [
             ("messages", statistics.message_count, self.verdict.messages),
             ("chunks", statistics.chunk_count.into(), self.verdict.chunks),
-            ("attachments", statistics.attachment_count.into(), self.attachments.into()),
-            ("metadata records", statistics.metadata_count.into(), self.metadata.into()),
+            ("attachments", statistics.attachment_count.into(), self.attachments.len() as u64),
+            ("metadata records", statistics.metadata_count.into(), self.metadata.len() as u64),
         ];
         for (what, stated, found) in counts {
             if stated != found {
@@ -294,6 +303,76 @@ impl Check {
             if stated != found {
                 self.verdict.problem(format!("summary: {stated} messages stated on {topic}, {found} found"));
             }
+        }
+    }
+
+    /// Other programs may leave an index out; one that is there must be right.
+    fn compare_with_indexes(&mut self) {
+        let unindexed = self.chunks.keys().filter(|offset| !self.indexed_chunks.contains(offset)).count();
+        if unindexed > 0 {
+            self.verdict.problem(format!("summary: {unindexed} chunks are missing from the index"));
+        }
+        for (what, found, indexed) in [
+            ("attachments", &self.attachments, &self.indexed_attachments),
+            ("metadata records", &self.metadata, &self.indexed_metadata),
+        ] {
+            if !indexed.is_empty() && indexed != found {
+                self.verdict.problem(format!("summary: the index of {what} does not say where they are"));
+            }
+        }
+        let (indexed, messages) = (self.indexed_messages, self.verdict.messages);
+        if indexed != 0 && indexed != messages {
+            self.verdict.problem(format!("{indexed} messages are in the chunks' indexes, {messages} in the chunks"));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{fs, io::Cursor};
+
+    use super::*;
+    use crate::recording::RecordingWriter;
+
+    fn picture(width_px: u32) -> Vec<u8> {
+        let mut jpeg = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new(&mut jpeg)
+            .encode(&vec![90; width_px as usize * 16], width_px, 16, image::ExtendedColorType::L8)
+            .expect("encodes");
+        jpeg
+    }
+
+    fn pair(east_m: f64) -> omniloc::SurveyPair {
+        omniloc::SurveyPair { east_m, valid: true, ..Default::default() }
+    }
+
+    #[test]
+    fn each_inconsistency_is_reported() {
+        type Fill = fn(&mut RecordingWriter<Cursor<Vec<u8>>>) -> mcap::McapResult<()>;
+        let table: [(&str, Fill, &str); 6] = [
+            ("no image", |rec| rec.write_pair(1, 0, pair(0.0)), "1 pairs belong to images that are not"),
+            ("two pairs", |rec| rec.write_pair(1, 0, pair(0.0)).and(rec.write_pair(1, 0, pair(0.0))), "two pairs"),
+            ("NaN", |rec| rec.write_pair(1, 0, pair(f64::NAN)), "not a number"),
+            ("damaged", |rec| rec.write_image(1, 0, picture(16)[..100].to_vec()), "image 1: truncated"),
+            (
+                "sizes",
+                |rec| rec.write_image(1, 0, picture(16)).and(rec.write_image(2, 0, picture(24))),
+                "like the first",
+            ),
+            (
+                "order",
+                |rec| rec.write_image(2, 5, picture(16)).and(rec.write_image(1, 4, picture(16))),
+                "before image 2",
+            ),
+        ];
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        for (name, fill, expected) in table {
+            let mut recording = RecordingWriter::new(Cursor::new(Vec::new())).expect("starts");
+            fill(&mut recording).expect("writes");
+            let path = folder.path().join("a.mcap");
+            fs::write(&path, recording.finish().expect("finishes").into_inner()).expect("writes");
+            let problems = verify(&path).expect("readable").problems;
+            assert!(problems.iter().any(|problem| problem.contains(expected)), "{name}: {problems:?}");
         }
     }
 }
