@@ -1,3 +1,5 @@
 //! omniloc tells a vehicle where it is from one omnidirectional camera.
 
+pub mod calibrate;
+pub mod jpeg;
 pub mod types;

@@ -1,0 +1,158 @@
+//! Finds the donut in camera images: its centre and the radii of its two rims.
+//!
+//! Pure functions over luma images; no files, no clocks. Three steps, one file each:
+//!
+//! 1. `evidence`: temporal mean and deviation of every pixel. The rims stay, the content moves.
+//! 2. `search`: coarse-to-fine search for the concentric pair of circles with content between them and flatness beyond.
+//! 3. `fit`: sub-pixel rim points on 360 rays, robust least-squares circles, standard deviations.
+//!
+//! [`overlay`] draws the result on a frame for a person to judge.
+//!
+//! The *rim* is where image content changes to surround or hub: the middle of that edge. Pixel centres are at integer
+//! coordinates, as in [`DonutCalibration`](crate::types::DonutCalibration).
+
+mod evidence;
+mod fit;
+mod search;
+
+use evidence::Accumulator;
+use fit::Fit;
+
+use crate::types::LumaImage;
+
+/// Where the donut is, how well that is known, and whether to believe it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DonutEstimate {
+    pub center_x_px: f64,
+    pub center_y_px: f64,
+    pub inner_radius_px: f64,
+    pub outer_radius_px: f64,
+    /// Standard deviations of the four above.
+    pub center_x_std_px: f64,
+    pub center_y_std_px: f64,
+    pub inner_radius_std_px: f64,
+    pub outer_radius_std_px: f64,
+    pub inner_rim: RimEvidence,
+    pub outer_rim: RimEvidence,
+    /// Distance between the centres of the two rims when each is fitted alone.
+    pub center_disagreement_px: f64,
+    /// From 0 to 1: the weakest of the checks behind the verdict.
+    pub confidence: f64,
+    pub verdict: Verdict,
+    pub frames_used: u32,
+}
+
+/// How well one rim is seen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RimEvidence {
+    /// Share of its circumference inside the image.
+    pub visible: f64,
+    /// Share of the visible directions with an edge on the circle.
+    pub supported: f64,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub enum Verdict {
+    Sure,
+    /// What speaks against it, in words.
+    Doubtful(Vec<String>),
+}
+
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum FindDonutError {
+    #[error("no frames to find the donut in")]
+    NoFrames,
+    #[error("frame of {found_width_px} x {found_height_px} px among frames of {width_px} x {height_px} px")]
+    DifferentSizes { width_px: usize, height_px: usize, found_width_px: usize, found_height_px: usize },
+    #[error("frame says {width_px} x {height_px} px but has {pixels} pixels")]
+    BadFrame { width_px: usize, height_px: usize, pixels: usize },
+    #[error("image of {width_px} x {height_px} px is too small: a donut needs at least {MIN_SIDE_PX} px a side")]
+    TooSmall { width_px: usize, height_px: usize },
+    #[error("no donut found: {reason}")]
+    NotFound { reason: String },
+}
+
+/// Smallest image side: smaller images have too few pixels on the inner rim.
+pub const MIN_SIDE_PX: usize = 96;
+
+/// Finds the donut in frames held in memory; [`DonutFinder`] takes them one by one.
+///
+/// # Errors
+/// No frames, frames of different sizes, too small ones, or no donut in them.
+pub fn find_donut(frames: &[LumaImage]) -> Result<DonutEstimate, FindDonutError> {
+    let first = frames.first().ok_or(FindDonutError::NoFrames)?;
+    let mut finder = DonutFinder::new(first.width_px, first.height_px)?;
+    frames.iter().try_for_each(|frame| finder.add(frame))?;
+    finder.finish()
+}
+
+/// Gathers evidence frame by frame in memory that does not grow.
+#[derive(Debug, Clone)]
+pub struct DonutFinder {
+    evidence: Accumulator,
+}
+
+impl DonutFinder {
+    /// # Errors
+    /// When the image is smaller than [`MIN_SIDE_PX`] on a side.
+    pub fn new(width_px: usize, height_px: usize) -> Result<Self, FindDonutError> {
+        if width_px.min(height_px) < MIN_SIDE_PX {
+            return Err(FindDonutError::TooSmall { width_px, height_px });
+        }
+        Ok(Self { evidence: Accumulator::new(width_px, height_px) })
+    }
+
+    /// # Errors
+    /// When the frame's size is not that of the others; the frames before it still count.
+    pub fn add(&mut self, frame: &LumaImage) -> Result<(), FindDonutError> {
+        let (width_px, height_px) = (self.evidence.width_px, self.evidence.height_px);
+        if (frame.width_px, frame.height_px) != (width_px, height_px) {
+            let (found_width_px, found_height_px) = (frame.width_px, frame.height_px);
+            return Err(FindDonutError::DifferentSizes { width_px, height_px, found_width_px, found_height_px });
+        }
+        if frame.pixels.len() != width_px * height_px {
+            return Err(FindDonutError::BadFrame { width_px, height_px, pixels: frame.pixels.len() });
+        }
+        self.evidence.add(frame);
+        Ok(())
+    }
+
+    /// The donut in the frames so far.
+    ///
+    /// # Errors
+    /// No frames, or no donut in them.
+    pub fn finish(&self) -> Result<DonutEstimate, FindDonutError> {
+        if self.evidence.frames == 0 {
+            return Err(FindDonutError::NoFrames);
+        }
+        let maps = self.evidence.maps();
+        let mean_weight = if maps.show_motion() { search::MEAN_WEIGHT_WITH_MOTION } else { 1.0 };
+        let candidate = search::search(&maps, mean_weight)
+            .ok_or_else(|| FindDonutError::NotFound { reason: "no circle has a visible edge".to_owned() })?;
+        if std::env::var_os("OMNILOC_TRACE").is_some() {
+            eprintln!("candidate {candidate:?} weight {mean_weight}");
+        }
+        let fit = fit::fit(&maps, mean_weight, candidate.circles, search::search_error_px(&maps))
+            .ok_or_else(|| FindDonutError::NotFound { reason: "too few edges lie on a pair of circles".to_owned() })?;
+        if std::env::var_os("OMNILOC_TRACE").is_some() {
+            eprintln!("fit {fit:?}");
+        }
+        judge(&candidate, &fit, self.evidence.frames)
+    }
+}
+
+fn judge(candidate: &search::Candidate, fit: &Fit, frames_used: u32) -> Result<DonutEstimate, FindDonutError> {
+    let _ = candidate;
+    let rim = |s: fit::RimSupport| RimEvidence { visible: s.visible, supported: s.supported };
+    let [center_x_px, center_y_px] = fit.circles.center_px;
+    let [center_x_std_px, center_y_std_px, inner_radius_std_px, outer_radius_std_px] = fit.deviations_px;
+    Ok(DonutEstimate {
+        center_x_px, center_y_px,
+        inner_radius_px: fit.circles.inner_radius_px,
+        outer_radius_px: fit.circles.outer_radius_px,
+        center_x_std_px, center_y_std_px, inner_radius_std_px, outer_radius_std_px,
+        inner_rim: rim(fit.inner), outer_rim: rim(fit.outer),
+        center_disagreement_px: fit.center_disagreement_px,
+        confidence: 0.0, verdict: Verdict::Sure, frames_used,
+    })
+}

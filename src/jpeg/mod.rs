@@ -1,0 +1,5 @@
+//! JPEG in, luma out.
+
+mod decode;
+
+pub use decode::{JpegError, LumaDecoder};
