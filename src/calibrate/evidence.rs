@@ -95,8 +95,7 @@ impl Maps {
         let above = &self.values[y * self.width_px + x..][..2];
         let below = &self.values[(y + 1) * self.width_px + x..][..2];
         Some([0, 1].map(|i| {
-            (1.0 - v) * ((1.0 - u) * above[0][i] + u * above[1][i])
-                + v * ((1.0 - u) * below[0][i] + u * below[1][i])
+            (1.0 - v) * ((1.0 - u) * above[0][i] + u * above[1][i]) + v * ((1.0 - u) * below[0][i] + u * below[1][i])
         }))
     }
 

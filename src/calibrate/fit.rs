@@ -14,6 +14,8 @@ const SAMPLE_PX: f64 = 0.5;
 /// The gradient at a sample is taken between the samples this many before and after: over 2 px, about the width of a
 /// sharp rim.
 const GRADIENT_SAMPLES: usize = 2;
+/// Samples between the edge in both maps and the edge in the mean: 1.5 px.
+const NEAR_SAMPLES: usize = 3;
 /// An edge weaker than this is no edge, whatever the noise \[grey levels a px\]: JPEG's own artefacts.
 const MIN_GRADIENT: f32 = 0.75;
 /// Edges are searched within this many standard deviations of their Gaussian prior about the present circle.
@@ -71,7 +73,8 @@ pub(super) struct RimSupport {
 
 /// Fits the circles to the rims, starting no more than `start_error_px` from them. `None` when too few edges are found.
 pub(super) fn fit(maps: &Maps, mean_weight: f32, start: Circles, start_error_px: f64) -> Option<Fit> {
-    let threshold = (4.0 * mean_weight * maps.noise()).max(MIN_GRADIENT * mean_weight.max(0.5));
+    // Four times the noise of a gradient over 2 px from profiles averaged over three pixels: σ √2 / (2 √3) each.
+    let threshold = (4.0 * 0.41 * mean_weight * maps.noise()).max(MIN_GRADIENT * mean_weight.max(0.5));
     let finder = EdgeFinder { maps, mean_weight, threshold };
     let mut circles = start;
     let last_window = LAST_WINDOW_TOLERANCES * tolerance_px(start.outer_radius_px);
@@ -162,27 +165,42 @@ impl EdgeFinder<'_> {
         Some(profile)
     }
 
-    /// Offset of the strongest edge from the middle of the profile \[px\], weighted by a Gaussian prior; sub-pixel from
-    /// the parabola through the gradient at the peak and its neighbours. `None` when nothing exceeds the threshold.
+    /// Offset of the strongest edge from the middle of the profile \[px\], weighted by a Gaussian prior. `None` when
+    /// nothing exceeds the threshold.
+    ///
+    /// The edge is found in both maps together but measured in the mean where that shows it: when the camera shakes the
+    /// deviation is high on both sides of the rim, and its own edge lies on the flat side by about the shaking's
+    /// standard deviation, whereas the mean is blurred evenly. Sub-pixel from the centroid of the gradient above half its
+    /// peak, which also suits a defocused rim, where the gradient has a flat top.
     fn strongest_edge(&self, profile: &[[f32; 2]]) -> Option<f64> {
-        let gradients: Vec<f32> = profile
+        let scale = 1.0 / (2.0 * GRADIENT_SAMPLES as f32 * SAMPLE_PX as f32);
+        let gradients: Vec<[f32; 2]> = profile
             .windows(2 * GRADIENT_SAMPLES + 1)
             .map(|window| {
                 let (first, last) = (window[0], window[2 * GRADIENT_SAMPLES]);
-                let scale = 1.0 / (2.0 * GRADIENT_SAMPLES as f32 * SAMPLE_PX as f32);
-                (self.mean_weight * (last[0] - first[0]) * scale).hypot((last[1] - first[1]) * scale)
+                [0, 1].map(|map| ((last[map] - first[map]) * scale).abs())
             })
             .collect();
         let middle = (gradients.len() / 2) as f64;
         let prior = |i: usize| (-0.5 * ((i as f64 - middle) / middle * PRIOR_DEVIATIONS).powi(2)).exp() as f32;
-        let weighted = |i: usize| gradients[i] * prior(i);
-        let peak = (1..gradients.len().saturating_sub(1))
-            .filter(|&i| gradients[i] > self.threshold)
-            .max_by(|&a, &b| weighted(a).total_cmp(&weighted(b)))?;
-        let [before, at, after] = [gradients[peak - 1], gradients[peak], gradients[peak + 1]].map(f64::from);
-        let curvature = before - 2.0 * at + after;
-        let shift = if curvature < 0.0 { (0.5 * (before - after) / curvature).clamp(-1.0, 1.0) } else { 0.0 };
-        Some((peak as f64 - middle + shift) * SAMPLE_PX)
+        let both = |i: usize| (self.mean_weight * gradients[i][0]).hypot(gradients[i][1]);
+        let inside = 1..gradients.len().saturating_sub(1);
+        let peak = inside
+            .clone()
+            .filter(|&i| both(i) > self.threshold)
+            .max_by(|&a, &b| (both(a) * prior(a)).total_cmp(&(both(b) * prior(b))))?;
+        let near = peak.saturating_sub(NEAR_SAMPLES).max(inside.start)..(peak + NEAR_SAMPLES + 1).min(inside.end);
+        let of_mean = near.max_by(|&a, &b| gradients[a][0].total_cmp(&gradients[b][0]))?;
+        let map = if gradients[of_mean][0] > gradients[peak][1] { 0 } else { 1 };
+        let peak = if map == 0 { of_mean } else { peak };
+        let half_height = 0.5 * gradients[peak][map];
+        let above = |&i: &usize| gradients[i][map] > half_height;
+        let (mut moment, mut weight) = (0.0, 0.0);
+        for i in (0..peak).rev().take_while(above).chain((peak..gradients.len()).take_while(above)) {
+            moment += f64::from(gradients[i][map]) * i as f64;
+            weight += f64::from(gradients[i][map]);
+        }
+        Some((moment / weight - middle) * SAMPLE_PX)
     }
 }
 
@@ -284,11 +302,8 @@ fn neighbour_inflation(points: &[RimPoint], residuals: &[f64], deviation: f64) -
 /// e ≈ δx cos φ + δy sin φ + δr.
 fn center_disagreement_px(points: &[RimPoint], circles: &Circles) -> Option<f64> {
     let [inner, outer] = [Rim::Inner, Rim::Outer].map(|rim| {
-        let of_rim: Vec<(&RimPoint, f64)> = points
-            .iter()
-            .filter(|point| point.rim == rim)
-            .map(|point| (point, residual_px(point, circles)))
-            .collect();
+        let of_rim: Vec<(&RimPoint, f64)> =
+            points.iter().filter(|point| point.rim == rim).map(|point| (point, residual_px(point, circles))).collect();
         let residuals: Vec<f64> = of_rim.iter().map(|&(_, e)| e).collect();
         let deviation = robust_deviation_px(&residuals);
         let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());

@@ -6,19 +6,30 @@
 //! 2. `search`: coarse-to-fine search for the concentric pair of circles with content between them and flatness beyond.
 //! 3. `fit`: sub-pixel rim points on 360 rays, robust least-squares circles, standard deviations.
 //!
-//! [`overlay`] draws the result on a frame for a person to judge.
+//! `judge` decides whether to believe it, `wander` measures how far the donut moves from frame to frame, and [`overlay`]
+//! draws the result on a frame for a person to see.
 //!
 //! The *rim* is where image content changes to surround or hub: the middle of that edge. Pixel centres are at integer
 //! coordinates, as in [`DonutCalibration`](crate::types::DonutCalibration).
 
 mod evidence;
 mod fit;
+mod judge;
+mod overlay;
 mod search;
+#[cfg(test)]
+mod synthetic;
+#[cfg(test)]
+mod tests;
+mod wander;
+
+pub use overlay::overlay;
 
 use evidence::Accumulator;
 use fit::Fit;
+use wander::Wander;
 
-use crate::types::LumaImage;
+use crate::types::{AzimuthSense, DonutCalibration, LensKind, LumaImage};
 
 /// Where the donut is, how well that is known, and whether to believe it.
 #[derive(Debug, Clone, PartialEq)]
@@ -27,7 +38,8 @@ pub struct DonutEstimate {
     pub center_y_px: f64,
     pub inner_radius_px: f64,
     pub outer_radius_px: f64,
-    /// Standard deviations of the four above.
+    /// Standard deviations of the four above: of the donut's mean place in these frames. What one frame cannot show is
+    /// how far the camera shakes; from eight frames on that is measured and included.
     pub center_x_std_px: f64,
     pub center_y_std_px: f64,
     pub inner_radius_std_px: f64,
@@ -36,6 +48,9 @@ pub struct DonutEstimate {
     pub outer_rim: RimEvidence,
     /// Distance between the centres of the two rims when each is fitted alone.
     pub center_disagreement_px: f64,
+    /// How far the centre moves from frame to frame, root mean square of an axis (shaking or a loose lens). `None` with
+    /// fewer than eight frames.
+    pub wander_px: Option<f64>,
     /// From 0 to 1: the weakest of the checks behind the verdict.
     pub confidence: f64,
     pub verdict: Verdict,
@@ -90,6 +105,7 @@ pub fn find_donut(frames: &[LumaImage]) -> Result<DonutEstimate, FindDonutError>
 #[derive(Debug, Clone)]
 pub struct DonutFinder {
     evidence: Accumulator,
+    wander: Wander,
 }
 
 impl DonutFinder {
@@ -99,7 +115,7 @@ impl DonutFinder {
         if width_px.min(height_px) < MIN_SIDE_PX {
             return Err(FindDonutError::TooSmall { width_px, height_px });
         }
-        Ok(Self { evidence: Accumulator::new(width_px, height_px) })
+        Ok(Self { evidence: Accumulator::new(width_px, height_px), wander: Wander::default() })
     }
 
     /// # Errors
@@ -114,6 +130,16 @@ impl DonutFinder {
             return Err(FindDonutError::BadFrame { width_px, height_px, pixels: frame.pixels.len() });
         }
         self.evidence.add(frame);
+        match self.wander.reference() {
+            Some(circles) => self.wander.add(frame, circles),
+            // At 4, 8, 16, ... frames: seldom enough to cost little when there is no donut.
+            None if self.evidence.frames >= 4 && self.evidence.frames.is_power_of_two() => {
+                if let Ok((_, fit)) = self.find() {
+                    self.wander.start(fit.circles);
+                }
+            }
+            None => (),
+        }
         Ok(())
     }
 
@@ -125,34 +151,70 @@ impl DonutFinder {
         if self.evidence.frames == 0 {
             return Err(FindDonutError::NoFrames);
         }
+        let (candidate, mut fit) = self.find()?;
+        let wander_px = self.wander.deviation_px();
+        let of_mean_px = wander_px.unwrap_or(0.0) / f64::from(self.evidence.frames).sqrt();
+        // Shaking moves the centre, not the radii.
+        fit.deviations_px[0] = fit.deviations_px[0].hypot(of_mean_px);
+        fit.deviations_px[1] = fit.deviations_px[1].hypot(of_mean_px);
+        let mut estimate = judge::judge(&candidate, &fit, self.evidence.frames)?;
+        estimate.wander_px = wander_px;
+        Ok(estimate)
+    }
+
+    fn find(&self) -> Result<(search::Candidate, Fit), FindDonutError> {
+        let not_found = |reason: &str| FindDonutError::NotFound { reason: reason.to_owned() };
         let maps = self.evidence.maps();
         let mean_weight = if maps.show_motion() { search::MEAN_WEIGHT_WITH_MOTION } else { 1.0 };
-        let candidate = search::search(&maps, mean_weight)
-            .ok_or_else(|| FindDonutError::NotFound { reason: "no circle has a visible edge".to_owned() })?;
-        if std::env::var_os("OMNILOC_TRACE").is_some() {
-            eprintln!("candidate {candidate:?} weight {mean_weight}");
-        }
+        let candidate = search::search(&maps, mean_weight).ok_or_else(|| not_found("no circle has a visible edge"))?;
         let fit = fit::fit(&maps, mean_weight, candidate.circles, search::search_error_px(&maps))
-            .ok_or_else(|| FindDonutError::NotFound { reason: "too few edges lie on a pair of circles".to_owned() })?;
-        if std::env::var_os("OMNILOC_TRACE").is_some() {
-            eprintln!("fit {fit:?}");
-        }
-        judge(&candidate, &fit, self.evidence.frames)
+            .ok_or_else(|| not_found("too few edges lie on a pair of circles"))?;
+        Ok((candidate, fit))
     }
 }
 
-fn judge(candidate: &search::Candidate, fit: &Fit, frames_used: u32) -> Result<DonutEstimate, FindDonutError> {
-    let _ = candidate;
-    let rim = |s: fit::RimSupport| RimEvidence { visible: s.visible, supported: s.supported };
-    let [center_x_px, center_y_px] = fit.circles.center_px;
-    let [center_x_std_px, center_y_std_px, inner_radius_std_px, outer_radius_std_px] = fit.deviations_px;
-    Ok(DonutEstimate {
-        center_x_px, center_y_px,
-        inner_radius_px: fit.circles.inner_radius_px,
-        outer_radius_px: fit.circles.outer_radius_px,
-        center_x_std_px, center_y_std_px, inner_radius_std_px, outer_radius_std_px,
-        inner_rim: rim(fit.inner), outer_rim: rim(fit.outer),
-        center_disagreement_px: fit.center_disagreement_px,
-        confidence: 0.0, verdict: Verdict::Sure, frames_used,
-    })
+/// What the picture alone does not show: how the panorama is cut out of the donut.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Orientation {
+    pub top_is_outer: bool,
+    pub start_angle_rad: f64,
+    pub clockwise: bool,
+    pub azimuth: AzimuthSense,
+}
+
+impl Default for Orientation {
+    /// A lens that shows the sky at the outer rim, seen upright: row 0 is the outer rim, columns run clockwise from the
+    /// image's +x axis, and the world azimuth grows with them.
+    fn default() -> Self {
+        Self { top_is_outer: true, start_angle_rad: 0.0, clockwise: true, azimuth: AzimuthSense::Ccw }
+    }
+}
+
+impl From<&DonutCalibration> for Orientation {
+    fn from(known: &DonutCalibration) -> Self {
+        Self {
+            top_is_outer: known.top_is_outer,
+            start_angle_rad: known.start_angle_rad,
+            clockwise: known.clockwise,
+            azimuth: known.azimuth,
+        }
+    }
+}
+
+impl DonutEstimate {
+    pub fn calibration(&self, orientation: &Orientation) -> DonutCalibration {
+        // Finer digits than a hundredth of the systematic 0.1 px mean nothing.
+        let rounded = |px: f64| (px * 1000.0).round() / 1000.0;
+        DonutCalibration {
+            kind: LensKind::Donut,
+            center_x_px: rounded(self.center_x_px),
+            center_y_px: rounded(self.center_y_px),
+            inner_radius_px: rounded(self.inner_radius_px),
+            outer_radius_px: rounded(self.outer_radius_px),
+            top_is_outer: orientation.top_is_outer,
+            start_angle_rad: orientation.start_angle_rad,
+            clockwise: orientation.clockwise,
+            azimuth: orientation.azimuth,
+        }
+    }
 }

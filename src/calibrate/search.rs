@@ -8,7 +8,7 @@
 //! ```
 //!
 //! Textured content has a middling E everywhere, so what counts is how far a rim rises above what lies on its flat
-//! side: beyond the outer rim, within the inner one.
+//! side: beyond the outer rim, within the inner one. And all between the rims is livelier than all beyond them.
 
 use std::f32::consts::TAU;
 
@@ -28,11 +28,13 @@ pub(super) struct Candidate {
     pub circles: Circles,
     pub inner_rise: f32,
     pub outer_rise: f32,
+    /// How much livelier it is between the rims than inside and around them, as a difference of mean edge shares.
+    pub contrast: f32,
 }
 
 impl Candidate {
     fn score(&self) -> f32 {
-        self.inner_rise + self.outer_rise
+        self.inner_rise + self.outer_rise + self.contrast
     }
 }
 
@@ -45,16 +47,22 @@ const COARSEST_SIDE_PX: usize = 60;
 const MIN_VISIBLE_SHARE: f32 = 0.6;
 /// Rings of the flat side that a rim is compared with, in px of the level beyond the rim. The edge itself smears over
 /// the first two.
-const FLAT_SIDE_PX: std::ops::RangeInclusive<usize> = 3..=7;
+const FLAT_SIDE_PX: [usize; 2] = [3, 7];
+/// The donut's width has to leave something between its rims \[px of a level\].
+const MIN_WIDTH_PX: usize = 2 * FLAT_SIDE_PX[0];
+/// Smallest outer radius as a part of the shorter image side: a smaller donut has too few pixels to localize with.
+const MIN_OUTER_SHARE: f32 = 0.2;
 /// No lens has a hub of more than this part of the outer radius: the panorama would be too low to be of use.
 const MAX_RADIUS_RATIO: f32 = 0.8;
+/// Nor of less than this part: a dot, not a hub.
+const MIN_RADIUS_RATIO: f32 = 0.12;
 /// Smallest inner radius on a level \[px\]: below, a circle is not told from a dot.
 const MIN_INNER_RADIUS_PX: usize = 3;
 /// Gradient below which an edge counts for little even without any noise \[grey levels a px\]: JPEG's own artefacts.
 const MIN_GRADIENT: f32 = 1.5;
 /// Weight of the mean map's edges where content moved: the mean then also shows static clutter (lens housing,
 /// reflections on the hub), the deviation does not.
-pub(super) const MEAN_WEIGHT_WITH_MOTION: f32 = 0.3;
+pub(super) const MEAN_WEIGHT_WITH_MOTION: f32 = 0.1;
 
 /// The best pair of circles \[px of `maps`\], to about a pixel of the second coarsest level. `None` when the image is too
 /// small for any.
@@ -108,6 +116,29 @@ fn level_px(original_px: f64, factor: usize) -> f64 {
     (original_px - (factor - 1) as f64 / 2.0) / factor as f64
 }
 
+/// Cumulative over the rings r = 0, 1, ... px: edge weights, and directions inside the image.
+struct Rings {
+    sums: Vec<[f32; 2]>,
+}
+
+impl Rings {
+    fn last(&self) -> usize {
+        self.sums.len() - 2
+    }
+
+    /// Share of the directions in which this ring lies inside the image.
+    fn visible(&self, ring: usize) -> f32 {
+        (self.sums[ring + 1][1] - self.sums[ring][1]) / DIRECTIONS as f32
+    }
+
+    /// Mean edge share of the visible part of some rings, both included; 0 when hardly anything of them is visible.
+    fn mean(&self, first: usize, last: usize) -> f32 {
+        let (before, after) = (self.sums[first.min(last)], self.sums[last + 1]);
+        let weight = after[1] - before[1];
+        if weight > 0.1 * DIRECTIONS as f32 { (after[0] - before[0]) / weight } else { 0.0 }
+    }
+}
+
 /// Gradients of both maps at one resolution.
 struct Level {
     width: usize,
@@ -117,6 +148,7 @@ struct Level {
     /// g₀ of the module's formula, squared.
     gradient_scale: f32,
     directions: Vec<[f32; 2]>,
+    min_outer_radius: usize,
     max_radius: usize,
 }
 
@@ -144,76 +176,75 @@ impl Level {
         let gradient_scale = (3.0 * mean_weight * reduced.noise()).max(MIN_GRADIENT * mean_weight.max(0.5));
         // A circle of this radius about the centre of a square image shows MIN_VISIBLE_SHARE of itself.
         let max_radius = (0.65 * width.min(height) as f32) as usize;
-        Self { width, height, gradients, gradient_scale, directions, max_radius }
+        let min_outer_radius = (MIN_OUTER_SHARE * width.min(height) as f32) as usize;
+        Self { width, height, gradients, gradient_scale, directions, min_outer_radius, max_radius }
     }
 
     /// Best pair of radii about a centre \[px of this level\].
     fn best_circles(&self, center: [f32; 2]) -> Option<Candidate> {
-        let (share, visible) = self.edge_shares(center);
-        let rise = |radius: usize, flat: &mut dyn Iterator<Item = usize>| {
-            let (mut edges, mut weight) = (0.0, 0.0);
-            for r in flat {
-                edges += share[r] * visible[r];
-                weight += visible[r];
-            }
-            // Hardly anything of the flat side visible: the edge has to speak for itself.
-            share[radius] - if weight > 0.1 { edges / weight } else { 0.0 }
-        };
+        let rings = self.edge_shares(center);
+        let seen = |radius: &usize| rings.visible(*radius) >= MIN_VISIBLE_SHARE;
+        let inner_rises: Vec<(usize, f32)> = (MIN_INNER_RADIUS_PX..self.max_radius)
+            .filter(seen)
+            .map(|r| (r, rings.mean(r, r) - rings.mean(r.saturating_sub(FLAT_SIDE_PX[1]), r - FLAT_SIDE_PX[0])))
+            .collect();
         let mut best: Option<Candidate> = None;
-        let mut best_inner = (0, f32::NEG_INFINITY);
-        let mut next_inner = MIN_INNER_RADIUS_PX;
-        for outer in MIN_INNER_RADIUS_PX + 3..=self.max_radius {
-            while next_inner as f32 <= MAX_RADIUS_RATIO * outer as f32 && next_inner + 3 <= outer {
-                let flat = next_inner.saturating_sub(*FLAT_SIDE_PX.end())..=next_inner - *FLAT_SIDE_PX.start();
-                let inner_rise = rise(next_inner, &mut flat.into_iter());
-                if visible[next_inner] >= MIN_VISIBLE_SHARE && inner_rise > best_inner.1 {
-                    best_inner = (next_inner, inner_rise);
+        for outer in (self.min_outer_radius..=self.max_radius).filter(seen) {
+            let outer_rise = rings.mean(outer, outer) - rings.mean(outer + FLAT_SIDE_PX[0], outer + FLAT_SIDE_PX[1]);
+            let still_outside = rings.mean(outer + FLAT_SIDE_PX[0], rings.last());
+            for &(inner, inner_rise) in &inner_rises {
+                if inner as f32 > MAX_RADIUS_RATIO * outer as f32 || inner + MIN_WIDTH_PX > outer {
+                    break;
                 }
-                next_inner += 1;
-            }
-            if visible[outer] < MIN_VISIBLE_SHARE || best_inner.0 == 0 {
-                continue;
-            }
-            let flat = outer + FLAT_SIDE_PX.start()..=(outer + FLAT_SIDE_PX.end()).min(share.len() - 1);
-            let outer_rise = rise(outer, &mut flat.into_iter());
-            if best.is_none_or(|best| best_inner.1 + outer_rise > best.score()) {
-                best = Some(Candidate {
-                    circles: Circles {
-                        center_px: center.map(f64::from),
-                        inner_radius_px: best_inner.0 as f64,
-                        outer_radius_px: outer as f64,
-                    },
-                    inner_rise: best_inner.1,
-                    outer_rise,
-                });
+                if (inner as f32) < MIN_RADIUS_RATIO * outer as f32 {
+                    continue;
+                }
+                let still_inside = rings.mean(0, inner - FLAT_SIDE_PX[0]);
+                let lively = rings.mean(inner + FLAT_SIDE_PX[0], outer - FLAT_SIDE_PX[0]);
+                let contrast = lively - 0.5 * (still_outside + still_inside);
+                if best.is_none_or(|best| inner_rise + outer_rise + contrast > best.score()) {
+                    best = Some(Candidate {
+                        circles: Circles {
+                            center_px: center.map(f64::from),
+                            inner_radius_px: inner as f64,
+                            outer_radius_px: outer as f64,
+                        },
+                        inner_rise,
+                        outer_rise,
+                        contrast,
+                    });
+                }
             }
         }
         best
     }
 
     /// E(r) of the module's formula for r = 0, 1, ... px, and the share of directions inside the image.
-    fn edge_shares(&self, [center_x, center_y]: [f32; 2]) -> (Vec<f32>, Vec<f32>) {
-        let radii = self.max_radius + FLAT_SIDE_PX.end() + 1;
-        let (mut edges, mut visible) = (vec![0.0; radii], vec![0.0; radii]);
+    fn edge_shares(&self, [center_x, center_y]: [f32; 2]) -> Rings {
+        // One entry more than there are rings: sums up to but without the ring.
+        let mut sums = vec![[0.0; 2]; self.max_radius + FLAT_SIDE_PX[1] + 2];
+        let radii = sums.len() - 1;
         let (right, bottom) = (self.width as f32 - 1.5, self.height as f32 - 1.5);
         for &[ux, uy] in &self.directions {
-            for r in 0..radii {
+            for (r, sum) in sums[1..=radii].iter_mut().enumerate() {
                 let (x, y) = (center_x + r as f32 * ux, center_y + r as f32 * uy);
                 // The outermost pixels have no gradient.
                 if !(x >= 0.5 && y >= 0.5 && x < right && y < bottom) {
                     break;
                 }
                 let g = &self.gradients[(y + 0.5) as usize * self.width + (x + 0.5) as usize];
-                let gradient = (ux * g[0] + uy * g[1]).hypot(ux * g[2] + uy * g[3]);
-                edges[r] += gradient / (gradient + self.gradient_scale);
-                visible[r] += 1.0;
+                let (mean, deviation) = (ux * g[0] + uy * g[1], ux * g[2] + uy * g[3]);
+                // Not `hypot`: it is many times slower, and grey levels do not overflow.
+                let gradient = (mean * mean + deviation * deviation).sqrt();
+                sum[0] += gradient / (gradient + self.gradient_scale);
+                sum[1] += 1.0;
             }
         }
-        for (edge, visible) in edges.iter_mut().zip(&mut visible) {
-            *edge /= f32::max(*visible, 1.0);
-            *visible /= DIRECTIONS as f32;
+        for ring in 1..=radii {
+            let before = sums[ring - 1];
+            sums[ring] = [sums[ring][0] + before[0], sums[ring][1] + before[1]];
         }
-        (edges, visible)
+        Rings { sums }
     }
 
     /// Moves the centre to the best of its eight neighbours until none is better, with steps halved down to ½ px.
@@ -222,7 +253,9 @@ impl Level {
         let mut step = first_step;
         while step >= 0.5 {
             let [x, y] = best.circles.center_px.map(|c| c as f32);
-            let neighbours = (-1..=1).flat_map(|j| (-1..=1).map(move |i| [x + i as f32 * step, y + j as f32 * step]));
+            let neighbours = (-1..=1).flat_map(|j| {
+                (-1..=1).filter(move |&i| (i, j) != (0, 0)).map(move |i| [x + i as f32 * step, y + j as f32 * step])
+            });
             let better = neighbours
                 .filter_map(|center| self.best_circles(center))
                 .max_by(|a, b| a.score().total_cmp(&b.score()))
