@@ -136,3 +136,20 @@ const FONT: &[(char, [u8; 5])] = &[
     ('F', [0x7F, 0x09, 0x09, 0x09, 0x01]), ('L', [0x7F, 0x40, 0x40, 0x40, 0x40]), ('O', [0x3E, 0x41, 0x41, 0x41, 0x3E]),
     ('T', [0x01, 0x01, 0x7F, 0x01, 0x01]), ('U', [0x3F, 0x40, 0x40, 0x40, 0x3F]),
 ];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::calibrate::{find_donut, synthetic::SyntheticDonut};
+
+    #[test]
+    fn the_font_has_every_letter_of_the_legend() {
+        let mut donut = find_donut(&SyntheticDonut::day(1).frames(1)).expect("a donut");
+        let mut lines = legend(&donut);
+        donut.verdict = Verdict::Doubtful(Vec::new());
+        lines.extend(legend(&donut));
+        for letter in lines.iter().flat_map(|(text, _)| text.chars()).chain("0123456789-".chars()) {
+            assert!(letter == ' ' || FONT.iter().any(|(known, _)| *known == letter), "{letter} is missing");
+        }
+    }
+}
