@@ -23,8 +23,8 @@ impl Check {
 const SURE_CONFIDENCE: f64 = 0.5;
 
 /// The limits come from the four data sets (rises of 0.65 and more, support of 0.84 and more in every single frame),
-/// from synthetic donuts at night, out of focus and in noise, and from 350 photographs, pages and noise images without
-/// a donut (rises below 0.45 or support below 0.6).
+/// from synthetic donuts at night, out of focus and in noise, and from 366 photographs, pages, noise images and parts of
+/// donuts, each of which fails at least one of the first four checks.
 pub(super) fn judge(candidate: &Candidate, fit: &Fit, frames_used: u32) -> Result<DonutEstimate, FindDonutError> {
     let percent = |share: f64| format!("{:.0} %", 100.0 * share);
     let rims = [("inner", &fit.inner, candidate.inner_rise), ("outer", &fit.outer, candidate.outer_rise)];
