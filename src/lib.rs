@@ -1,5 +1,6 @@
 //! omniloc tells a vehicle where it is from one omnidirectional camera.
 
+pub mod calibrate;
 pub mod commands;
 pub mod evaluate;
 pub mod features;

@@ -1,9 +1,11 @@
 //! The commands: one file each. Results go to stdout, diagnostics to stderr.
 
+pub mod calibrate;
 pub mod check;
 pub mod evaluate;
 pub mod export;
 pub mod file_kind;
+pub mod frame_source;
 pub mod import;
 pub mod info;
 pub mod options;
@@ -25,6 +27,7 @@ pub const BAD_ARGUMENTS: u8 = 2;
 #[derive(Debug, Subcommand)]
 pub enum Command {
     Import(import::Args),
+    Calibrate(calibrate::CalibrateArgs),
     Evaluate(evaluate::Args),
     Export(export::Args),
     Info(info::Args),
@@ -35,6 +38,7 @@ impl Command {
     pub fn run(&self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Import(args) => import::run(args),
+            Self::Calibrate(args) => calibrate::run(args),
             Self::Evaluate(args) => evaluate::run(args),
             Self::Export(args) => export::run(args),
             Self::Info(args) => info::run(args),

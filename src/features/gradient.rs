@@ -1,4 +1,4 @@
-//! Fourier signature of gradient orientations: `gradient` and `gradient-coarse`.
+//! Fourier signatures of gradient orientations: `gradient`, `gradient-unsigned` and `gradient-coarse`.
 
 use std::f32::consts::TAU;
 use std::sync::Arc;
@@ -9,9 +9,25 @@ use realfft::{RealFftPlanner, RealToComplex};
 use crate::panorama::{Panorama, WIDE_COLUMNS, WIDE_ROWS};
 
 /// Orientation bins over the full circle: a dark-to-bright edge is not a bright-to-dark one.
-const BINS: usize = 8;
+const BINS: usize = 12;
 /// Azimuthal harmonics kept, from 0.
 const HARMONICS: usize = 5;
+
+/// Whether an edge and its opposite are told apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sign {
+    Signed,
+    Unsigned,
+}
+
+impl Sign {
+    const fn bins(self) -> usize {
+        match self {
+            Self::Signed => BINS,
+            Self::Unsigned => BINS / 2,
+        }
+    }
+}
 
 /// Sizes of one signature; pixels are those of its own reduced panorama.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -29,7 +45,7 @@ pub struct Sizes {
 /// 256 × 64 pixels in 32 bands.
 pub const FINE: Sizes = Sizes { reduction: 2, bands: 32, blur_px: 1.0, contrast_px: 8.0 };
 /// 128 × 32 pixels in 16 bands.
-pub const COARSE: Sizes = Sizes { reduction: 4, bands: 16, blur_px: 1.0, contrast_px: 4.0 };
+pub const COARSE: Sizes = Sizes { reduction: 4, bands: 16, blur_px: 1.5, contrast_px: 4.0 };
 
 /// Gray values are counted from this, so that the logarithm of a dark, noisy pixel stays calm.
 const DARK_LEVEL: f32 = 16.0;
@@ -48,7 +64,8 @@ const CONTRAST_FLOOR: f32 = 0.05;
 /// y_(b,e,k) = √ |Σ_a h_b(e, a) exp(−2πi k a / W)| / W          k = 0 … 4, divided by the norm of the whole vector
 /// ```
 ///
-/// A turn of the vehicle shifts the azimuth and leaves the magnitudes as they are. Columns wrap round; rows are repeated
+/// (b, e, k in that order.) The unsigned signature adds opposite bins before the transform: where sun and shadow swap
+/// sides, edges keep their direction but not their sign. A turn of the vehicle shifts the azimuth and leaves the magnitudes as they are. Columns wrap round; rows are repeated
 /// at the rims.
 pub struct GradientSignature {
     sizes: Sizes,
@@ -69,8 +86,8 @@ pub struct GradientSignature {
 }
 
 impl Sizes {
-    pub const fn dimensions(self) -> usize {
-        BINS * self.bands * HARMONICS
+    pub const fn dimensions(self, sign: Sign) -> usize {
+        sign.bins() * self.bands * HARMONICS
     }
 }
 
@@ -97,12 +114,16 @@ impl GradientSignature {
         }
     }
 
-    pub fn describe(&mut self, panorama: &Panorama, properties: &mut [f32]) {
+    pub fn describe(&mut self, panorama: &Panorama, sign: Sign, properties: &mut [f32]) {
         self.reduce_to_log(panorama);
         blur(&mut self.plane, &mut self.scratch, self.columns, &self.blur);
         self.differentiate();
         blur(&mut self.local_mean, &mut self.scratch, self.columns, &self.contrast);
         self.gather_orientations();
+        if sign == Sign::Unsigned {
+            let (first, opposite) = self.bins.split_at_mut(BINS / 2 * self.sizes.bands * self.columns);
+            first.iter_mut().zip(&*opposite).for_each(|(sum, opposite)| *sum += opposite);
+        }
         self.transform_bands(properties);
     }
 
@@ -257,9 +278,11 @@ mod tests {
         panorama
     }
 
-    fn describe(sizes: Sizes, panorama: &Panorama) -> Vec<f32> {
-        let mut properties = vec![0.0; sizes.dimensions()];
-        GradientSignature::new(sizes).describe(panorama, &mut properties);
+    const ALL: [(Sizes, Sign); 3] = [(FINE, Sign::Signed), (FINE, Sign::Unsigned), (COARSE, Sign::Signed)];
+
+    fn describe((sizes, sign): (Sizes, Sign), panorama: &Panorama) -> Vec<f32> {
+        let mut properties = vec![0.0; sizes.dimensions(sign)];
+        GradientSignature::new(sizes).describe(panorama, sign, &mut properties);
         properties
     }
 
@@ -269,9 +292,9 @@ mod tests {
 
     #[test]
     fn a_turn_leaves_the_properties_as_they_are() {
-        for sizes in [FINE, COARSE] {
-            let before = describe(sizes, &textured());
-            let after = describe(sizes, &textured().rolled(8 * 29));
+        for signature in ALL {
+            let before = describe(signature, &textured());
+            let after = describe(signature, &textured().rolled(8 * 29));
             assert!(distance(&before, &after) < 2e-2, "{}", distance(&before, &after));
         }
     }
@@ -284,17 +307,17 @@ mod tests {
         for (i, value) in other.wide.iter_mut().enumerate() {
             *value += 30.0 * ((i / WIDE_COLUMNS) as f32 / 3.0).sin();
         }
-        for sizes in [FINE, COARSE] {
-            let here = describe(sizes, &textured());
+        for signature in ALL {
+            let here = describe(signature, &textured());
             assert!((here.iter().map(|y| y * y).sum::<f32>() - 1.0).abs() < 1e-5, "unit norm");
-            let (light, scene) = (distance(&here, &describe(sizes, &brighter)), distance(&here, &describe(sizes, &other)));
+            let (light, scene) = (distance(&here, &describe(signature, &brighter)), distance(&here, &describe(signature, &other)));
             assert!(light < 0.05 && scene > 5.0 * light, "light {light}, scene {scene}");
         }
     }
 
     #[test]
     fn a_blank_panorama_has_a_descriptor() {
-        assert!(describe(FINE, &Panorama::zeros()).iter().all(|y| y.is_finite()));
+        assert!(describe((FINE, Sign::Signed), &Panorama::zeros()).iter().all(|y| y.is_finite()));
     }
 
     #[test]

@@ -16,7 +16,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::panorama::Panorama;
-use gradient::GradientSignature;
+use gradient::{GradientSignature, Sign};
 use steerable::{Response, SteerablePyramid};
 
 /// A kind of image properties.
@@ -37,12 +37,14 @@ pub enum Descriptor {
     SpEnergy,
     /// Fourier signature of gradient orientations.
     Gradient,
-    /// The same at half the resolution.
+    /// The same with opposite orientations added.
+    GradientUnsigned,
+    /// [`Descriptor::Gradient`] at half the resolution.
     GradientCoarse,
 }
 
 impl Descriptor {
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Fft,
         Self::Hist,
         Self::HistSqrt,
@@ -50,6 +52,7 @@ impl Descriptor {
         Self::SpLog,
         Self::SpEnergy,
         Self::Gradient,
+        Self::GradientUnsigned,
         Self::GradientCoarse,
     ];
     /// The three the paper evaluates.
@@ -61,8 +64,9 @@ impl Descriptor {
             Self::Fft => fft::DIMENSIONS,
             Self::Hist | Self::HistSqrt => histogram::DIMENSIONS,
             Self::Sp | Self::SpLog | Self::SpEnergy => steerable::DIMENSIONS,
-            Self::Gradient => gradient::FINE.dimensions(),
-            Self::GradientCoarse => gradient::COARSE.dimensions(),
+            Self::Gradient => gradient::FINE.dimensions(Sign::Signed),
+            Self::GradientUnsigned => gradient::FINE.dimensions(Sign::Unsigned),
+            Self::GradientCoarse => gradient::COARSE.dimensions(Sign::Signed),
         }
     }
 
@@ -76,6 +80,7 @@ impl Descriptor {
             Self::SpLog => "sp-log",
             Self::SpEnergy => "sp-energy",
             Self::Gradient => "gradient",
+            Self::GradientUnsigned => "gradient-unsigned",
             Self::GradientCoarse => "gradient-coarse",
         }
     }
@@ -153,8 +158,9 @@ impl Describer {
             Descriptor::Sp => self.pyramid.describe(panorama, Response::Magnitude, properties),
             Descriptor::SpLog => self.pyramid.describe(panorama, Response::LogMagnitude, properties),
             Descriptor::SpEnergy => self.pyramid.describe(panorama, Response::Energy, properties),
-            Descriptor::Gradient => self.gradient.describe(panorama, properties),
-            Descriptor::GradientCoarse => self.gradient_coarse.describe(panorama, properties),
+            Descriptor::Gradient => self.gradient.describe(panorama, Sign::Signed, properties),
+            Descriptor::GradientUnsigned => self.gradient.describe(panorama, Sign::Unsigned, properties),
+            Descriptor::GradientCoarse => self.gradient_coarse.describe(panorama, Sign::Signed, properties),
         }
     }
 }

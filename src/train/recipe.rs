@@ -88,7 +88,7 @@ impl Recipe {
 
     fn default_over(descriptors: &[Descriptor]) -> Self {
         let model =
-            Model::SharedField(noise_whitening::Settings { features: 96, length_scale_spacings: 2.0, ridge: 0.05 });
+            Model::SharedField(noise_whitening::Settings { features: 96, length_scale_spacings: 1.75, ridge: 0.05 });
         let group = |&descriptor| GroupRecipe { descriptor, model, noise: NoiseModel::UnknownScale, weight: 1.0 };
         Self {
             name: RecipeName::Default,
@@ -110,6 +110,6 @@ impl Recipe {
 }
 
 /// Descriptors of the default recipe.
-const DEFAULT: [Descriptor; 2] = [Descriptor::Gradient, Descriptor::GradientCoarse];
+const DEFAULT: [Descriptor; 3] = [Descriptor::Gradient, Descriptor::GradientUnsigned, Descriptor::GradientCoarse];
 /// Perturbed copies of every learning image.
 pub const PERTURBED_COPIES: usize = 2;

@@ -92,7 +92,7 @@ impl Survey {
         on_frames: impl Fn(usize),
     ) -> Result<Self, SurveyError> {
         let first = &recordings[0];
-        let calibration = first.calibration()?.clone();
+        let calibration = first.calibration()?;
         let mut survey = Self {
             calibration,
             origin: first.origin,
@@ -122,13 +122,13 @@ impl Survey {
     fn check_same_lens(&self, first: &Recording, recording: &Recording) -> Result<(), SurveyError> {
         let found = recording.calibration()?;
         let names = || (first.path.display().to_string(), recording.path.display().to_string());
-        if *found != self.calibration {
+        if found != self.calibration {
             let (first, other) = names();
             let describe = |c: &DonutCalibration| {
                 let (x, y) = (c.center_x_px, c.center_y_px);
                 format!("centre ({x}, {y}) and radii {}..{} px", c.inner_radius_px, c.outer_radius_px)
             };
-            let (expected, found) = (describe(&self.calibration), describe(found));
+            let (expected, found) = (describe(&self.calibration), describe(&found));
             return Err(SurveyError::MixedCalibrations { first, other, expected, found });
         }
         if recording.origin != self.origin {
