@@ -7,6 +7,7 @@ use serde_json::json;
 
 use super::{
     DONE, FAILED,
+    evaluate::open_map,
     file_kind::{FileKind, file_kind},
     options::check_input,
     print, printable,
@@ -28,12 +29,34 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_input(&args.file)?;
     match file_kind(&args.file).with_context(|| format!("reading {}", args.file.display()))? {
-        FileKind::Map => anyhow::bail!("{}: maps are not supported yet", args.file.display()),
+        FileKind::Map => return check_map(args),
         FileKind::Recording => {}
     }
     let verdict = verify(&args.file)?;
     let sound = verdict.is_sound();
     print(&if args.json { as_json(args, &verdict) } else { as_text(args, &verdict) })?;
+    Ok(if sound { DONE } else { FAILED }.into())
+}
+
+/// A map that loads is sound: checksum, shapes and values are checked then.
+fn check_map(args: &Args) -> anyhow::Result<ExitCode> {
+    let map = open_map(&args.file);
+    let problems: Vec<String> = map.as_ref().err().map(|error| format!("{error:#}")).into_iter().collect();
+    let sound = map.is_ok();
+    let file = args.file.display();
+    print(&if args.json {
+        format!("{:#}\n", json!({"file": args.file, "kind": "map", "sound": sound, "problems": problems}))
+    } else {
+        match &map {
+            Ok(map) => format!(
+                "{file}: sound: {} groups, {} learning positions, {} cells\n",
+                map.groups.len(),
+                map.positions_m.len(),
+                map.cells.len()
+            ),
+            Err(error) => format!("problem: {}\n{file}: NOT SOUND\n", printable(&format!("{error:#}"))),
+        }
+    })?;
     Ok(if sound { DONE } else { FAILED }.into())
 }
 

@@ -1,58 +1,349 @@
-//! `omniloc evaluate`
-use std::path::PathBuf;
+//! `omniloc evaluate`: the paper's tables, and more, on one's own data.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use crate::evaluate::{ErrorFigures, protocol};
-use crate::recording::Recording;
-use crate::train::*;
+use anyhow::Context;
+use serde_json::json;
 
+use super::options::check_input;
+use super::progress::Progress;
+use super::survey::{default_grid_step_m, open_recordings, parse_descriptor, read_to_learn, read_to_match, read_truth};
+use super::{BadArgument, DONE, print};
+use crate::evaluate::{Entry, ErrorFigures, LEGEND, against_map, table};
+use crate::features::Descriptor;
+use crate::map::{FeatureMap, file};
+use crate::recording::{Recording, RecordingError, write_file_atomically};
+use crate::train::{
+    Outcome, Recipe, RecipeName, Selection, Split, SplitKind, Survey, Trial, component_median, noisy, run as run_trial,
+};
+use crate::types::PositionM;
+
+/// Measure how well the method localizes on recordings
+///
+/// Without --map: the paper's protocol on every recording by itself - 50 % of the frames to learn from, 25 % to choose
+/// features on, 25 % to test on - with the paper's recipe and the default one side by side, over several seeds, once
+/// with frames drawn at random and once with whole stretches of the drive. With --map: every frame of other recordings
+/// against that map.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    recording: PathBuf,
-    #[arg(long)]
-    split_csv: Option<PathBuf>,
-    #[arg(long, default_value_t = 1.0)]
-    grid_step_m: f64,
-    #[arg(long, default_value_t = 1)]
-    seeds: u64,
-    #[arg(long)]
-    truth: Option<PathBuf>,
-    #[arg(long)]
-    recipe: RecipeName,
+    /// Recordings
+    #[arg(required = true, value_name = "REC.mcap")]
+    pub recordings: Vec<PathBuf>,
+    /// Measure against this map, frame by frame
+    #[arg(long, value_name = "AREA.map")]
+    pub map: Option<PathBuf>,
+    /// Recipes to compare
+    #[arg(long, value_enum, value_delimiter = ',', default_values = ["paper", "default"])]
+    pub recipe: Vec<RecipeName>,
+    /// Feature types, in place of the recipes' own
+    #[arg(long, value_delimiter = ',', value_parser = parse_descriptor)]
+    pub features: Vec<Descriptor>,
+    /// How features are chosen [default: backward for the paper's recipe, none for the default one]
+    #[arg(long, value_enum)]
+    pub select: Option<Selection>,
+    /// How frames are split: random, blocked, or a CSV file `index,set` with learning, validation, test
+    #[arg(long, value_delimiter = ',', default_values = ["random", "blocked"])]
+    pub split: Vec<String>,
+    /// First seed of the splits
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Number of seeds
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub seeds: u64,
+    /// Variants of the random split: plain; noisy, with 0.3 m of noise on all positions; fixed, with every panorama
+    /// turned by its yaw
+    #[arg(long, value_enum, value_delimiter = ',', default_values = ["plain", "noisy", "fixed"])]
+    pub variants: Vec<Variant>,
+    /// Distance of neighbouring candidate cells [m; default: 1 outdoors, 0.1 where the positions lie within 20 m]
+    #[arg(long, value_name = "M")]
+    pub grid_step_m: Option<f64>,
+    /// Measure errors against these positions (CSV `index,x_m,y_m`) instead of the recorded ones
+    #[arg(long, value_name = "CSV")]
+    pub truth: Option<PathBuf>,
+    /// Write all results as one JSON object
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Put every test frame's estimate into the JSON
+    #[arg(long, requires = "json")]
+    pub frames: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Variant {
+    Plain,
+    Noisy,
+    Fixed,
+}
+
+/// What a trial is run on.
+struct Case {
+    split_name: String,
+    split: Split,
+    /// `None` for a split from a file.
+    seed: Option<u64>,
+    variant: Variant,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let t = std::time::Instant::now();
-    let recording = Recording::open(&args.recording)?;
-    let recipe = Recipe::new(args.recipe, &[]);
-    let options = SurveyOptions { descriptors: recipe.descriptors(), fixed: false, repetitions: PERTURBED_COPIES, perturbed: recipe.perturbed(), seed: 0 };
-    let survey = Survey::read(&[recording], &options, |_| {})?;
-    eprintln!("read {:?}", t.elapsed());
-    let recorded = survey.positions_m();
-    let mut truth = recorded.clone();
-    if let Some(t) = &args.truth {
-        for (i, l) in std::fs::read_to_string(t)?.lines().skip(1).enumerate() {
-            let v: Vec<f64> = l.split(',').map(|v| v.parse().unwrap()).collect();
-            truth[i] = [v[1], v[2]];
+    let entries = evaluate(args)?;
+    if let Some(path) = &args.json {
+        write_json(path, args, &entries)?;
+    }
+    Ok(DONE.into())
+}
+
+/// Evaluates and prints.
+pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
+    if args.truth.is_some() && args.recordings.len() > 1 {
+        return Err(BadArgument("--truth goes with one recording".into()).into());
+    }
+    if let Some(json) = &args.json {
+        let folder = json.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        if !folder.is_dir() {
+            return Err(
+                BadArgument(format!("--json {}: there is no folder {}", json.display(), folder.display())).into()
+            );
         }
     }
-    let indices: Vec<usize> = survey.frames.iter().map(|f| f.index).collect();
-    for seed in 0..args.seeds {
-        let split = match &args.split_csv {
-            Some(p) => Split::from_csv(std::fs::File::open(p)?, &indices)?,
-            None => Split::new(SplitKind::Random, survey.len(), seed),
+    let recordings = open_recordings(&args.recordings)?;
+    let progress = Progress::new();
+    let mut all = Vec::new();
+    for (number, recording) in recordings.iter().enumerate() {
+        let entries = match &args.map {
+            Some(path) => on_map(args, path, recording, &progress)?,
+            None => protocol(args, recording, &progress)?,
         };
-        let trial = protocol::Trial { recipe: &recipe, split: &split, grid_step_m: args.grid_step_m, recorded_m: &recorded };
-        let outcomes = protocol::run(&survey, &trial, |_| {})?;
-        let tt: Vec<_> = split.test.iter().map(|&i| truth[i]).collect();
-        let tv: Vec<_> = split.validation.iter().map(|&i| truth[i]).collect();
-        for o in outcomes {
-            let a = ErrorFigures::of(&o.all_test_m, &tt).unwrap();
-            let b = ErrorFigures::of(&o.kept_test_m, &tt).unwrap();
-            let v = ErrorFigures::of(&o.kept_validation_m, &tv).unwrap();
-            println!("{seed} {:16} rank {} kept {} all {:.2} ({:.2}) BE V {:.2} T {:.2} ({:.2}) p95 {:.2} >10 {:.3} bic {:?} {:?} {:?}", o.features, o.rank, o.kept, a.rmse_m, a.median_m, v.rmse_m, b.rmse_m, b.median_m, b.p95_m, b.share_over_10m, o.bic_all, o.bic_kept, o.warnings);
-        }
-        eprintln!("{:?}", t.elapsed());
+        progress.finish();
+        print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
+        all.extend(entries);
     }
-    Ok(ExitCode::SUCCESS)
+    print(&format!("\n{LEGEND}"))?;
+    Ok(all)
+}
+
+/// Every frame of `recording` against a map.
+fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) -> anyhow::Result<Vec<Entry>> {
+    let map = open_map(path)?;
+    let descriptors = map.info.groups.iter().map(|group| group.recipe.descriptor).collect();
+    let survey = read_to_match(recording, descriptors, progress)?;
+    map.info
+        .check_lens(&survey.calibration, survey.image_size_px)
+        .with_context(|| format!("{} against {}", recording.path.display(), path.display()))?;
+    let truth_m = truth(args, &survey)?;
+    let indices: Vec<usize> = survey.frames.iter().map(|frame| frame.index).collect();
+    let base = Entry {
+        dataset: recording.name.clone(),
+        estimator: "single",
+        n_learning: map.positions_m.len(),
+        n_learned_from: map.positions_m.len(),
+        n_test: survey.len(),
+        ..Entry::default()
+    };
+    let mut entries: Vec<Entry> = against_map(&survey, &map)
+        .into_iter()
+        .map(|outcome| {
+            let entry = Entry {
+                recipe: Some(map.info.recipe.name()),
+                features: outcome.features,
+                m: Some(outcome.m),
+                rank: Some(outcome.rank),
+                kept: Some(outcome.kept),
+                compression: compression(outcome.m, outcome.kept),
+                ..base.clone()
+            };
+            let entry = entry.with_figures(ErrorFigures::of(&outcome.estimates_m, &truth_m));
+            if args.frames { entry.with_frames(&indices, &truth_m, &outcome.estimates_m) } else { entry }
+        })
+        .collect();
+    entries.push(median_entry(base, &map.positions_m, &truth_m));
+    Ok(entries)
+}
+
+pub fn open_map(path: &Path) -> anyhow::Result<FeatureMap> {
+    check_input(path)?;
+    let reader = std::fs::File::open(path).with_context(|| format!("opening the map {}", path.display()))?;
+    file::read(reader).with_context(|| format!("loading the map {}", path.display()))
+}
+
+/// The paper's protocol on one recording.
+fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::Result<Vec<Entry>> {
+    let recipes: Vec<Recipe> = args
+        .recipe
+        .iter()
+        .map(|&name| Recipe::new(name, &args.features))
+        .map(|recipe| args.select.map_or(recipe.clone(), |selection| recipe.with_selection(selection)))
+        .collect();
+    let recording_of = std::slice::from_ref(recording);
+    let plain = read_to_learn(recording_of, &recipes, false, progress)?;
+    let wants_fixed = args.variants.contains(&Variant::Fixed) && args.split.iter().any(|split| split == "random");
+    let fixed = match wants_fixed && plain.frames.iter().all(|frame| frame.yaw_rad.is_some()) {
+        true => Some(read_to_learn(recording_of, &recipes, true, progress)?),
+        false => None,
+    };
+    if wants_fixed && fixed.is_none() {
+        eprintln!("note: {}: not every frame has a yaw; there are no (fixed) rows", recording.name);
+    }
+    let truth_m = truth(args, &plain)?;
+    let mut entries = Vec::new();
+    for case in cases(args, &plain)? {
+        let survey = match (case.variant, &fixed) {
+            (Variant::Fixed, Some(fixed)) => fixed,
+            (Variant::Fixed, None) => continue,
+            _ => &plain,
+        };
+        entries.extend(trial_entries(args, recording, survey, &recipes, &truth_m, &case, progress)?);
+    }
+    Ok(entries)
+}
+
+/// Splits, seeds and variants, in the order of the table.
+fn cases(args: &Args, survey: &Survey) -> anyhow::Result<Vec<Case>> {
+    let mut cases = Vec::new();
+    for name in &args.split {
+        let kind = match name.as_str() {
+            "random" => SplitKind::Random,
+            "blocked" => SplitKind::Blocked,
+            path => {
+                check_input(Path::new(path))
+                    .with_context(|| format!("--split {path}: neither random nor blocked nor a file"))?;
+                let indices: Vec<usize> = survey.frames.iter().map(|frame| frame.index).collect();
+                let file = std::fs::File::open(path).with_context(|| format!("opening the split {path}"))?;
+                let split = Split::from_csv(file, &indices).with_context(|| format!("reading the split {path}"))?;
+                cases.push(Case { split_name: path.into(), split, seed: None, variant: Variant::Plain });
+                continue;
+            }
+        };
+        let variants: &[Variant] = if kind == SplitKind::Random { &args.variants } else { &[Variant::Plain] };
+        for &variant in variants {
+            for seed in args.seed..args.seed + args.seeds {
+                let split = Split::new(kind, survey.len(), seed);
+                cases.push(Case { split_name: name.clone(), split, seed: Some(seed), variant });
+            }
+        }
+    }
+    Ok(cases)
+}
+
+/// All rows of one case: the recipes, and the answer that knows nothing.
+fn trial_entries(
+    args: &Args,
+    recording: &Recording,
+    survey: &Survey,
+    recipes: &[Recipe],
+    truth_m: &[PositionM],
+    case: &Case,
+    progress: &Progress,
+) -> anyhow::Result<Vec<Entry>> {
+    let recorded_m = match case.variant {
+        Variant::Noisy => noisy(&survey.positions_m(), case.seed.unwrap_or(0)),
+        _ => survey.positions_m(),
+    };
+    // Noise on all positions is also on those that errors are measured against, unless the truth is given.
+    let truth_m = if args.truth.is_some() { truth_m } else { &recorded_m };
+    let pick = |rows: &[usize], of: &[PositionM]| -> Vec<PositionM> { rows.iter().map(|&row| of[row]).collect() };
+    let (test_m, validation_m) = (pick(&case.split.test, truth_m), pick(&case.split.validation, &recorded_m));
+    let indices: Vec<usize> = case.split.test.iter().map(|&row| survey.frames[row].index).collect();
+    let grid_step_m = args.grid_step_m.unwrap_or_else(|| default_grid_step_m(&recorded_m));
+    let base = Entry {
+        dataset: recording.name.clone(),
+        estimator: "single",
+        split: Some(case.split_name.clone()),
+        seed: case.seed,
+        noisy: case.variant == Variant::Noisy,
+        fixed: case.variant == Variant::Fixed,
+        n_learning: case.split.learning.len(),
+        n_validation: case.split.validation.len(),
+        n_test: case.split.test.len(),
+        n_learned_from: case.split.learning.len(),
+        ..Entry::default()
+    };
+    let mut entries = Vec::new();
+    for recipe in recipes {
+        let part = match case.seed {
+            Some(seed) => format!("{} {} {seed}", recipe.name.name(), case.split_name),
+            None => recipe.name.name().to_owned(),
+        };
+        let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &recorded_m };
+        let outcomes = run_trial(survey, &trial, |step| progress.step(&part, step))?;
+        for outcome in &outcomes.rows {
+            let base = Entry { n_learned_from: outcomes.learned_from, ..base.clone() };
+            let entry = outcome_entry(base, recipe, outcome, &validation_m, &test_m);
+            let estimates_m = estimates_of(recipe, outcome);
+            entries.push(if args.frames { entry.with_frames(&indices, &test_m, estimates_m) } else { entry });
+        }
+    }
+    entries.push(median_entry(base, &pick(&case.split.learning, &recorded_m), &test_m));
+    Ok(entries)
+}
+
+/// The estimates that a recipe stands for: with the features it keeps.
+fn estimates_of<'a>(recipe: &Recipe, outcome: &'a Outcome) -> &'a [PositionM] {
+    match recipe.selection {
+        Selection::None => &outcome.all_test_m,
+        Selection::Backward => &outcome.kept_test_m,
+    }
+}
+
+fn outcome_entry(
+    base: Entry,
+    recipe: &Recipe,
+    outcome: &Outcome,
+    validation_m: &[PositionM],
+    test_m: &[PositionM],
+) -> Entry {
+    let rmse_m =
+        |estimates_m: &[PositionM], truth_m: &[PositionM]| ErrorFigures::of(estimates_m, truth_m).map(|f| f.rmse_m);
+    let selects = recipe.selection != Selection::None;
+    let entry = Entry {
+        recipe: Some(recipe.name.name()),
+        features: outcome.features.clone(),
+        m: Some(outcome.m),
+        rank: Some(outcome.rank),
+        kept: Some(outcome.kept),
+        compression: compression(outcome.m, outcome.kept),
+        rmse_all_test_m: rmse_m(&outcome.all_test_m, test_m),
+        rmse_be_validation_m: rmse_m(&outcome.kept_validation_m, validation_m),
+        rmse_be_test_m: selects.then(|| rmse_m(&outcome.kept_test_m, test_m)).flatten(),
+        bic_all: outcome.bic_all,
+        bic_kept: outcome.bic_kept.filter(|_| selects),
+        ..base
+    };
+    entry.with_figures(ErrorFigures::of(estimates_of(recipe, outcome), test_m))
+}
+
+/// The row of always answering the median of the learning positions.
+fn median_entry(base: Entry, learning_m: &[PositionM], truth_m: &[PositionM]) -> Entry {
+    let median_m = component_median(learning_m);
+    let answers = vec![median_m; truth_m.len()];
+    Entry { features: "median".into(), ..base }.with_figures(ErrorFigures::of(&answers, truth_m))
+}
+
+fn compression(m: usize, kept: usize) -> Option<f64> {
+    (kept > 0).then(|| m as f64 / kept as f64)
+}
+
+fn truth(args: &Args, survey: &Survey) -> anyhow::Result<Vec<PositionM>> {
+    match &args.truth {
+        Some(path) => read_truth(path, survey),
+        None => Ok(survey.positions_m()),
+    }
+}
+
+fn write_json(path: &Path, args: &Args, entries: &[Entry]) -> anyhow::Result<()> {
+    let command: Vec<String> = std::env::args().collect();
+    let datasets: Vec<String> = args.recordings.iter().map(|path| path.display().to_string()).collect();
+    let object = json!({
+        "program": env!("CARGO_PKG_VERSION"),
+        "command": command,
+        "datasets": datasets,
+        "results": entries,
+    });
+    write_file_atomically(path, |out| {
+        let cannot = |cause| RecordingError::CannotWrite { path: path.into(), cause };
+        serde_json::to_writer_pretty(&mut *out, &object).map_err(|error| cannot(error.into()))?;
+        out.write_all(b"\n").map_err(cannot)
+    })?;
+    Ok(())
 }

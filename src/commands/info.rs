@@ -7,7 +7,9 @@ use serde_json::json;
 
 use super::{
     DONE,
+    evaluate::open_map,
     file_kind::{FileKind, file_kind},
+    map_report,
     options::check_input,
     print, printable,
 };
@@ -26,17 +28,36 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_input(&args.file)?;
     match file_kind(&args.file).with_context(|| format!("reading {}", args.file.display()))? {
-        FileKind::Map => anyhow::bail!("{}: maps are not supported yet", args.file.display()),
-        FileKind::Recording => {}
-    }
-    let recording = Recording::open_any(&args.file)?;
-    let size_bytes = fs::metadata(&args.file).map(|facts| facts.len()).unwrap_or_default();
-    if args.json {
-        print(&format!("{:#}\n", as_json(&recording, size_bytes)))?;
-    } else {
-        print(&as_text(&recording, size_bytes))?;
+        FileKind::Map => show_map(args)?,
+        FileKind::Recording => show_recording(args)?,
     }
     Ok(DONE.into())
+}
+
+fn show_map(args: &Args) -> anyhow::Result<()> {
+    let map = open_map(&args.file)?;
+    let size_bytes = size_bytes(args);
+    print(&if args.json {
+        format!("{:#}\n", map_report::as_json(&args.file, &map, size_bytes))
+    } else {
+        map_report::as_text(&args.file, &map, size_bytes)
+    })?;
+    Ok(())
+}
+
+fn show_recording(args: &Args) -> anyhow::Result<()> {
+    let recording = Recording::open_any(&args.file)?;
+    let size_bytes = size_bytes(args);
+    print(&if args.json {
+        format!("{:#}\n", as_json(&recording, size_bytes))
+    } else {
+        as_text(&recording, size_bytes)
+    })?;
+    Ok(())
+}
+
+fn size_bytes(args: &Args) -> u64 {
+    fs::metadata(&args.file).map(|facts| facts.len()).unwrap_or_default()
 }
 
 /// Seconds between the first and the last message of all topics.

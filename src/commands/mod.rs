@@ -2,13 +2,18 @@
 
 pub mod calibrate;
 pub mod check;
+pub mod demo;
 pub mod evaluate;
 pub mod export;
 pub mod file_kind;
 pub mod frame_source;
 pub mod import;
 pub mod info;
+pub mod map_report;
 pub mod options;
+pub mod progress;
+pub mod survey;
+pub mod train;
 
 use std::{
     io::{self, Write},
@@ -26,8 +31,10 @@ pub const BAD_ARGUMENTS: u8 = 2;
 
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    Demo(demo::Args),
     Import(import::Args),
     Calibrate(calibrate::CalibrateArgs),
+    Train(train::Args),
     Evaluate(evaluate::Args),
     Export(export::Args),
     Info(info::Args),
@@ -37,8 +44,10 @@ pub enum Command {
 impl Command {
     pub fn run(&self) -> anyhow::Result<ExitCode> {
         match self {
+            Self::Demo(args) => demo::run(args),
             Self::Import(args) => import::run(args),
             Self::Calibrate(args) => calibrate::run(args),
+            Self::Train(args) => train::run(args),
             Self::Evaluate(args) => evaluate::run(args),
             Self::Export(args) => export::run(args),
             Self::Info(args) => info::run(args),

@@ -255,8 +255,8 @@ fn atan2(y: f32, x: f32) -> f32 {
     let (ax, ay) = (x.abs(), y.abs());
     let ratio = ax.min(ay) / ax.max(ay).max(f32::MIN_POSITIVE);
     let square = ratio * ratio;
-    let polynomial = 0.999_866
-        + square * (-0.330_299_5 + square * (0.180_141 + square * (-0.085_133 + square * 0.020_835_1)));
+    let polynomial =
+        0.999_866 + square * (-0.330_299_5 + square * (0.180_141 + square * (-0.085_133 + square * 0.020_835_1)));
     let first_octant = ratio * polynomial;
     let first_quadrant = if ay > ax { FRAC_PI_2 - first_octant } else { first_octant };
     let upper_half = if x < 0.0 { PI - first_quadrant } else { first_quadrant };
@@ -310,7 +310,8 @@ mod tests {
         for signature in ALL {
             let here = describe(signature, &textured());
             assert!((here.iter().map(|y| y * y).sum::<f32>() - 1.0).abs() < 1e-5, "unit norm");
-            let (light, scene) = (distance(&here, &describe(signature, &brighter)), distance(&here, &describe(signature, &other)));
+            let (light, scene) =
+                (distance(&here, &describe(signature, &brighter)), distance(&here, &describe(signature, &other)));
             assert!(light < 0.05 && scene > 5.0 * light, "light {light}, scene {scene}");
         }
     }

@@ -9,7 +9,6 @@ mod histogram;
 pub mod scaling;
 mod steerable;
 
-
 use std::fmt;
 use std::str::FromStr;
 

@@ -97,7 +97,8 @@ fn whitening(centered: &Mat<f64>) -> Option<Mat<f64>> {
     let directions = svd.V();
     Some(Mat::from_fn(rank, d, |r, k| {
         let direction = directions.col(r);
-        let dominant = direction.iter().fold(0.0_f64, |dominant, &v| if v.abs() > dominant.abs() { v } else { dominant });
+        let dominant =
+            direction.iter().fold(0.0_f64, |dominant, &v| if v.abs() > dominant.abs() { v } else { dominant });
         direction[k] * dominant.signum() / variances[r].sqrt()
     }))
 }

@@ -308,9 +308,8 @@ mod tests {
         // Three columns of the coarsest band, which are 8 of the panorama's each.
         let mut brighter = panorama.rolled(8 * 8 * 3);
         brighter.gray.iter_mut().for_each(|value| *value += 5.0);
-        for (a, b) in describe::<f32>(&panorama, Response::Magnitude)
-            .iter()
-            .zip(describe::<f32>(&brighter, Response::Magnitude))
+        for (a, b) in
+            describe::<f32>(&panorama, Response::Magnitude).iter().zip(describe::<f32>(&brighter, Response::Magnitude))
         {
             assert!((a - b).abs() < 1e-4 * a, "{a} became {b}");
         }

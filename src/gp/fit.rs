@@ -35,7 +35,8 @@ impl Bounds {
     /// (lower, upper) of the logarithms for a feature with standard deviation `std`.
     fn in_logs(&self, std: f64, extent_m: [f64; 2]) -> ([f64; 4], [f64; 4]) {
         let side = |side: usize| {
-            let length = |axis: usize| (self.length_scale_ratio[side] * extent_m[axis]).max(self.min_length_scale_m).ln();
+            let length =
+                |axis: usize| (self.length_scale_ratio[side] * extent_m[axis]).max(self.min_length_scale_m).ln();
             [(self.signal_std_ratio[side] * std).ln(), (self.noise_std_ratio[side] * std).ln(), length(0), length(1)]
         };
         (side(0), side(1))
@@ -173,13 +174,7 @@ pub fn fit_each(
         .collect()
 }
 
-fn fit_one(
-    learning: &LearningPositions,
-    z: &[f64],
-    bounds: &Bounds,
-    start: Hyperparameters,
-    spacing_m: f64,
-) -> Fit {
+fn fit_one(learning: &LearningPositions, z: &[f64], bounds: &Bounds, start: Hyperparameters, spacing_m: f64) -> Fit {
     let (lower, upper) = bounds.in_logs(standard_deviation(z), extent_m(learning.positions()));
     let objective = |log: &[f64; 4]| {
         let (value, gradient) = likelihood_and_gradient(learning, z, &Hyperparameters::from_log(*log)).ok()?;
@@ -300,11 +295,8 @@ fn profile(learning: &LearningPositions, features: &Mat<f64>, length_scale_m: [f
                 })
                 .max_by(|a, b| a.0.total_cmp(&b.0));
             let (likelihood, variance, ratio) = best.expect("the grid is not empty");
-            let hyperparameters = Hyperparameters {
-                signal_std: variance.sqrt(),
-                noise_std: (ratio * variance).sqrt(),
-                length_scale_m,
-            };
+            let hyperparameters =
+                Hyperparameters { signal_std: variance.sqrt(), noise_std: (ratio * variance).sqrt(), length_scale_m };
             (likelihood, hyperparameters)
         })
         .collect()

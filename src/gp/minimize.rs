@@ -145,9 +145,14 @@ mod tests {
 
     #[test]
     fn the_bottom_of_a_curved_valley_is_found() {
-        let minimum =
-            minimize(rosenbrock, [-1.2, 1.0], [-5.0; 2], [5.0; 2], &Settings { gradient_tolerance: 1e-8, ..Settings::default() })
-                .expect("defined");
+        let minimum = minimize(
+            rosenbrock,
+            [-1.2, 1.0],
+            [-5.0; 2],
+            [5.0; 2],
+            &Settings { gradient_tolerance: 1e-8, ..Settings::default() },
+        )
+        .expect("defined");
         assert!(minimum.converged && minimum.evaluations < 100, "{minimum:?}");
         assert!(minimum.x.iter().all(|x| (x - 1.0).abs() < 1e-4), "{minimum:?}");
     }

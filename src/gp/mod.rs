@@ -146,9 +146,7 @@ impl<'a> Posterior<'a> {
             let mut c = Mat::from_fn(n, points.len(), |i, j| {
                 squared_exponential(self.learning.positions[i], points[j], &self.hyperparameters)
             });
-            mean.as_mut()
-                .subrows_mut(chunk * CHUNK, points.len())
-                .copy_from(c.transpose() * &self.weights);
+            mean.as_mut().subrows_mut(chunk * CHUNK, points.len()).copy_from(c.transpose() * &self.weights);
             solve_lower_triangular_in_place(self.factor.L(), c.as_mut(), Par::Seq);
             variance.extend((0..points.len()).map(|j| {
                 let explained: f64 = c.col(j).iter().map(|v| v * v).sum();
@@ -205,7 +203,8 @@ mod tests {
             .iter()
             .map(|point| list(point).try_into().expect("two coordinates"))
             .collect();
-        let prediction = Posterior::new(&learning, column(&z).as_ref(), theta).expect("positive definite").predict(&points);
+        let prediction =
+            Posterior::new(&learning, column(&z).as_ref(), theta).expect("positive definite").predict(&points);
         for (i, (mean, variance)) in list(&gp["mean"]).iter().zip(list(&gp["var"])).enumerate() {
             assert!((prediction.mean[(i, 0)] / mean - 1.0).abs() < 1e-6, "{} {mean}", prediction.mean[(i, 0)]);
             assert!((prediction.variance[i] / variance - 1.0).abs() < 1e-6);

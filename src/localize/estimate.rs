@@ -52,7 +52,10 @@ mod tests {
         let best = most_likely_cell(&log_likelihood);
         assert_eq!(cells.center_m(best), [2.0, 1.5]);
         let refined_m = refined_m(&cells, &log_likelihood, best);
-        assert!((refined_m[0] - summit_m[0]).abs() < 1e-5 && (refined_m[1] - summit_m[1]).abs() < 1e-5, "{refined_m:?}");
+        assert!(
+            (refined_m[0] - summit_m[0]).abs() < 1e-5 && (refined_m[1] - summit_m[1]).abs() < 1e-5,
+            "{refined_m:?}"
+        );
     }
 
     #[test]

@@ -25,7 +25,9 @@ pub struct Grid {
 pub enum CellsError {
     #[error("grid step {step_m} m: expected a positive number")]
     BadStep { step_m: f64 },
-    #[error("{cells:.0} candidate cells at a grid step of {step_m} m are more than {MAX_CELLS}; use a larger --grid-step-m")]
+    #[error(
+        "{cells:.0} candidate cells at a grid step of {step_m} m are more than {MAX_CELLS}; use a larger --grid-step-m"
+    )]
     TooMany { cells: f64, step_m: f64 },
 }
 
@@ -41,7 +43,8 @@ impl CandidateCells {
         if !(step_m.is_finite() && step_m > 0.0) {
             return Err(CellsError::BadStep { step_m });
         }
-        let bound = |axis: usize, pick: fn(f64, f64) -> f64| positions.iter().map(|p| p[axis]).reduce(pick).unwrap_or(0.0);
+        let bound =
+            |axis: usize, pick: fn(f64, f64) -> f64| positions.iter().map(|p| p[axis]).reduce(pick).unwrap_or(0.0);
         let origin_m = [bound(0, f64::min), bound(1, f64::min)];
         // A position on the far border keeps its cell however the division rounds.
         let count = |axis: usize| ((bound(axis, f64::max) - origin_m[axis]) / step_m - 1e-9).ceil().max(0.0) + 1.0;

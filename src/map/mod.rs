@@ -1,5 +1,201 @@
-//! The map.
+//! The map: what localizing needs to know of a place.
+//!
+//! A map is made by [`train`](crate::train) and never changed by localizing. It holds one *group* a descriptor: the
+//! scaling that turns properties into features, the learning features with the hyperparameters of their Gaussian
+//! processes, and the posterior of every feature on the candidate cells, which is all that matching a frame reads.
 
 mod cells;
+pub mod file;
+
+use faer::Mat;
+use serde::{Deserialize, Serialize};
 
 pub use cells::{CandidateCells, CellsError, Grid};
+pub use file::{FORMAT_VERSION, MapError};
+
+use crate::features::scaling::Scaling;
+use crate::localize::FieldOnCells;
+use crate::train::{GroupHyperparameters, GroupRecipe, RecipeName, Selection, SplitKind};
+use crate::types::{DonutCalibration, Geodetic, PositionM};
+
+#[derive(Debug, Clone)]
+pub struct FeatureMap {
+    pub info: MapInfo,
+    /// Learning positions \[m\].
+    pub positions_m: Vec<PositionM>,
+    pub cells: CandidateCells,
+    /// In the order of [`MapInfo::groups`].
+    pub groups: Vec<MapGroup>,
+}
+
+/// The numbers of one group: d properties, k features, n learning positions, c cells.
+#[derive(Debug, Clone)]
+pub struct MapGroup {
+    pub scaling: Scaling,
+    /// Learning features, n × k.
+    pub learning: Mat<f64>,
+    /// Posterior mean, k × c.
+    pub field_mean: Vec<f32>,
+    /// Predictive variance, noise included: k × c, or 1 × c where all features share it.
+    pub field_variance: Vec<f32>,
+}
+
+/// Everything but the large arrays.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MapInfo {
+    pub format_version: u32,
+    /// Version of the program that trained it.
+    pub program: String,
+    pub recordings: Vec<TrainedOn>,
+    pub recipe: RecipeName,
+    pub selection: Selection,
+    /// Positions are refined between the cells.
+    pub refine: bool,
+    pub split: SplitKind,
+    pub seed: u64,
+    pub origin: Option<Geodetic>,
+    pub calibration: DonutCalibration,
+    /// Width and height of the camera images \[px\].
+    pub image_size_px: [usize; 2],
+    pub grid: Grid,
+    pub groups: Vec<GroupInfo>,
+    /// Errors on frames that the choices were made on but that nothing was fitted to.
+    pub validation: Vec<ValidationFigures>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TrainedOn {
+    pub name: String,
+    pub frames: usize,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct GroupInfo {
+    pub recipe: GroupRecipe,
+    /// Features before and after the selection.
+    pub rank: usize,
+    pub features: usize,
+    pub hyperparameters: GroupHyperparameters,
+}
+
+/// Single-frame errors of one group, or of all fused \[m\].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ValidationFigures {
+    pub features: String,
+    pub frames: usize,
+    pub rmse_m: f64,
+    pub median_m: f64,
+    pub p95_m: f64,
+    pub share_over_10m: f64,
+}
+
+/// Donuts whose centre or radii differ by more than this are of another lens, or of one that was moved \[px\].
+const SAME_LENS_PX: f64 = 3.0;
+
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error(
+    "the map is of another lens: {what} is {found} here and {expected} in the map; \
+     calibrate the recording, or train a map with this lens"
+)]
+pub struct OtherLens {
+    what: &'static str,
+    found: String,
+    expected: String,
+}
+
+impl MapInfo {
+    /// Refuses frames of a camera that the map does not fit: other image size, other donut.
+    pub fn check_lens(&self, donut: &DonutCalibration, image_size_px: (usize, usize)) -> Result<(), OtherLens> {
+        let ours = &self.calibration;
+        let other = |what, found: String, expected: String| Err(OtherLens { what, found, expected });
+        if image_size_px != self.image_size_px.into() {
+            let expected = (self.image_size_px[0], self.image_size_px[1]);
+            return other("the image size", format!("{image_size_px:?} px"), format!("{expected:?} px"));
+        }
+        for (what, found, expected) in [
+            ("the centre's x", donut.center_x_px, ours.center_x_px),
+            ("the centre's y", donut.center_y_px, ours.center_y_px),
+            ("the inner radius", donut.inner_radius_px, ours.inner_radius_px),
+            ("the outer radius", donut.outer_radius_px, ours.outer_radius_px),
+        ] {
+            if (found - expected).abs() > SAME_LENS_PX {
+                return other(what, format!("{found:.1} px"), format!("{expected:.1} px"));
+            }
+        }
+        if donut.top_is_outer != ours.top_is_outer {
+            return other("top_is_outer", donut.top_is_outer.to_string(), ours.top_is_outer.to_string());
+        }
+        Ok(())
+    }
+}
+
+impl MapGroup {
+    /// The posterior, ready to match frames against.
+    pub fn field(&self) -> FieldOnCells {
+        let cells = self.field_mean.len() / self.scaling.features().max(1);
+        FieldOnCells::new(self.scaling.features(), cells, self.field_mean.clone(), &self.field_variance)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::features::Descriptor;
+    use crate::gp::Hyperparameters;
+    use crate::train::Recipe;
+    use crate::types::{AzimuthSense, LensKind};
+
+    /// Three positions, two features of `sp`.
+    pub fn small_map() -> FeatureMap {
+        let positions_m = vec![[0.0, 0.0], [1.0, 0.5], [2.0, 1.0]];
+        let cells = CandidateCells::around(&positions_m, 1.0, None).expect("a small grid");
+        let recipe = Recipe::new(RecipeName::Default, &[Descriptor::Sp]);
+        let hyperparameters = Hyperparameters { signal_std: 1.0, noise_std: 0.5, length_scale_m: [2.0; 2] };
+        let d = Descriptor::Sp.dimensions();
+        let c = cells.len();
+        FeatureMap {
+            info: MapInfo {
+                format_version: FORMAT_VERSION,
+                program: "0.0.0".into(),
+                recordings: vec![TrainedOn { name: "yard".into(), frames: 3 }],
+                recipe: RecipeName::Default,
+                selection: Selection::None,
+                refine: true,
+                split: SplitKind::Random,
+                seed: 0,
+                origin: None,
+                calibration: DonutCalibration {
+                    kind: LensKind::Donut,
+                    center_x_px: 320.0,
+                    center_y_px: 240.0,
+                    inner_radius_px: 50.0,
+                    outer_radius_px: 200.0,
+                    top_is_outer: true,
+                    start_angle_rad: 0.0,
+                    clockwise: true,
+                    azimuth: AzimuthSense::Ccw,
+                },
+                image_size_px: [640, 480],
+                grid: cells.grid,
+                groups: vec![GroupInfo {
+                    recipe: recipe.groups[0],
+                    rank: 3,
+                    features: 2,
+                    hyperparameters: GroupHyperparameters::Shared(hyperparameters),
+                }],
+                validation: Vec::new(),
+            },
+            groups: vec![MapGroup {
+                scaling: Scaling {
+                    mean: (0..d).map(|k| k as f64).collect(),
+                    projection: Mat::from_fn(2, d, |r, k| (r * d + k) as f64 * 0.1),
+                },
+                learning: Mat::from_fn(3, 2, |i, r| i as f64 - r as f64),
+                field_mean: (0..2 * c).map(|i| i as f32 * 0.25).collect(),
+                field_variance: vec![0.5; c],
+            }],
+            positions_m,
+            cells,
+        }
+    }
+}

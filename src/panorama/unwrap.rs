@@ -222,9 +222,14 @@ mod tests {
 
     #[test]
     fn row_zero_is_the_named_rim() {
-        let rings = LumaImage::from_fn(200, 180, |x, y| {
-            if (x as f64 - 99.5).hypot(y as f64 - 88.25) > 50.0 { 200 } else { 50 }
-        });
+        let rings =
+            LumaImage::from_fn(
+                200,
+                180,
+                |x, y| {
+                    if (x as f64 - 99.5).hypot(y as f64 - 88.25) > 50.0 { 200 } else { 50 }
+                },
+            );
         for (top_is_outer, first, last) in [(true, 200.0, 50.0), (false, 50.0, 200.0)] {
             let table = UnwrapTable::build(&DonutCalibration { top_is_outer, ..donut() }, 200, 180).expect("inside");
             let panorama = table.to_panorama(&rings);

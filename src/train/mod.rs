@@ -1,4 +1,7 @@
-//! Offline.
+//! Recordings → map. Offline only: nothing on the vehicle uses it.
+//!
+//! A [`Survey`] holds positions and properties of all frames; a [`Recipe`] says how they become features and Gaussian
+//! processes; [`run`] carries out the paper's protocol on a [`Split`]; [`train`] makes a map of everything.
 
 mod group;
 pub mod noise_whitening;
@@ -7,9 +10,123 @@ mod recipe;
 mod split;
 mod subset;
 mod survey;
+mod trial;
 
 pub use group::{GroupHyperparameters, LearnError, LearnedGroup};
 pub use recipe::{GroupRecipe, Model, PERTURBED_COPIES, Recipe, RecipeName, Selection};
 pub use split::{Split, SplitError, SplitKind};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination, component_median};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
+pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
+
+use crate::evaluate::ErrorFigures;
+use crate::gp::LearningPositions;
+use crate::gp::fit::median_neighbour_spacing_m;
+use crate::map::{
+    CandidateCells, FORMAT_VERSION, FeatureMap, GroupInfo, MapGroup, MapInfo, TrainedOn, ValidationFigures,
+};
+
+/// Choices of a training run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrainSettings {
+    pub split: SplitKind,
+    pub seed: u64,
+    pub grid_step_m: f64,
+    /// Only cells at most this far from a learning position become candidates; [`NEAR_SPACINGS`] × the spacing of the
+    /// positions if not given.
+    pub within_m: Option<f64>,
+}
+
+/// Cells further than this many median spacings from every learning position are left out.
+pub const NEAR_SPACINGS: f64 = 7.0;
+
+/// Makes a map of all frames of `survey`: Algorithm 1 of Do et al. (2015).
+///
+/// A quarter of the frames is first held back to choose features and to measure on. The map itself is then of all
+/// frames: a recipe without selection learns again from all; after a selection, the scaling and hyperparameters that it
+/// was made with are kept and the Gaussian processes conditioned on all frames. `sources` names the recordings.
+pub fn train(
+    survey: &Survey,
+    sources: &[String],
+    recipe: &Recipe,
+    settings: &TrainSettings,
+    on_step: impl Fn(Step) + Sync,
+) -> Result<FeatureMap, TrialError> {
+    let positions_m = survey.positions_m();
+    let mut split = Split::new(settings.split, survey.len(), settings.seed);
+    split.learning.append(&mut split.test);
+    split.learning.sort_unstable();
+    // Measured before anything is learned from the validation frames.
+    let held_back = Recipe { refit: false, ..recipe.clone() };
+    let trial =
+        Trial { recipe: &held_back, split: &split, grid_step_m: settings.grid_step_m, recorded_m: &positions_m };
+    let outcomes = run(survey, &trial, &on_step)?;
+    let truth_m: Vec<_> = split.validation.iter().map(|&row| positions_m[row]).collect();
+    let validation = outcomes.rows.iter().filter_map(|row| {
+        let figures = ErrorFigures::of(&row.kept_validation_m, &truth_m)?;
+        Some(ValidationFigures {
+            features: row.features.clone(),
+            frames: figures.n,
+            rmse_m: figures.rmse_m,
+            median_m: figures.median_m,
+            p95_m: figures.p95_m,
+            share_over_10m: figures.share_over_10m,
+        })
+    });
+    let validation = validation.collect();
+
+    let learning = LearningPositions::new(positions_m);
+    let near_m = NEAR_SPACINGS * median_neighbour_spacing_m(learning.positions());
+    let within_m = settings.within_m.unwrap_or(near_m.max(2.0 * settings.grid_step_m));
+    let cells = CandidateCells::around(learning.positions(), settings.grid_step_m, Some(within_m))?;
+    let centers_m = cells.centers_m();
+    let everything: Vec<usize> = (0..survey.len()).collect();
+    let (mut infos, mut groups) = (Vec::new(), Vec::new());
+    for selected in outcomes.groups.into_iter().filter(|group| group.features() > 0) {
+        let descriptor = selected.recipe.descriptor;
+        let properties = survey.properties(descriptor, &everything);
+        let group = match recipe.selection {
+            Selection::Backward => selected.conditioned_on(properties.as_ref()),
+            Selection::None => {
+                on_step(Step::Fitting { descriptor: descriptor.name(), features: descriptor.dimensions() });
+                let changes = survey.changes(descriptor, &everything);
+                let fitted = || on_step(Step::FeatureFitted);
+                LearnedGroup::learn(selected.recipe, &learning, properties.as_ref(), changes.as_ref(), fitted)?
+            }
+        };
+        let (field_mean, field_variance) = group.predict(&learning, &centers_m)?;
+        infos.push(GroupInfo {
+            recipe: group.recipe,
+            rank: group.rank,
+            features: group.features(),
+            hyperparameters: group.hyperparameters,
+        });
+        groups.push(MapGroup { scaling: group.scaling, learning: group.learning, field_mean, field_variance });
+        on_step(Step::Done);
+    }
+    if groups.is_empty() {
+        return Err(TrialError::NothingKept);
+    }
+    let frames_of = |recording: usize| survey.frames.iter().filter(|frame| frame.recording == recording).count();
+    let info = MapInfo {
+        format_version: FORMAT_VERSION,
+        program: env!("CARGO_PKG_VERSION").into(),
+        recordings: sources
+            .iter()
+            .enumerate()
+            .map(|(i, name)| TrainedOn { name: name.clone(), frames: frames_of(i) })
+            .collect(),
+        recipe: recipe.name,
+        selection: recipe.selection,
+        refine: recipe.refine,
+        split: settings.split,
+        seed: settings.seed,
+        origin: survey.origin,
+        calibration: survey.calibration.clone(),
+        image_size_px: survey.image_size_px.into(),
+        grid: cells.grid,
+        groups: infos,
+        validation,
+    };
+    Ok(FeatureMap { info, positions_m: learning.positions().to_vec(), cells, groups })
+}

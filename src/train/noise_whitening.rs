@@ -143,8 +143,7 @@ fn discriminant_directions(signal: &Mat<f64>, noise: &Mat<f64>, count: usize) ->
     let mut directions = Mat::from_fn(rank, count, |i, r| eigen.U()[(i, rank - 1 - r)]);
     solve_upper_triangular_in_place(factor.L().transpose(), directions.as_mut(), Par::Seq);
     for r in 0..count {
-        let dominant =
-            directions.col(r).iter().fold(0.0_f64, |most, &v| if v.abs() > most.abs() { v } else { most });
+        let dominant = directions.col(r).iter().fold(0.0_f64, |most, &v| if v.abs() > most.abs() { v } else { most });
         directions.col_mut(r).iter_mut().for_each(|v| *v *= dominant.signum());
     }
     Some(directions)

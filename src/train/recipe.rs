@@ -44,6 +44,8 @@ pub struct Recipe {
     pub selection: Selection,
     /// Look for the summit between the cells.
     pub refine: bool,
+    /// Learn from the validation frames too once nothing is left to choose: only without a selection.
+    pub refit: bool,
 }
 
 /// One descriptor's part of a recipe.
@@ -83,6 +85,7 @@ impl Recipe {
             groups: descriptors.iter().map(group).collect(),
             selection: Selection::Backward,
             refine: false,
+            refit: false,
         }
     }
 
@@ -95,7 +98,13 @@ impl Recipe {
             groups: descriptors.iter().map(group).collect(),
             selection: Selection::None,
             refine: true,
+            refit: true,
         }
+    }
+
+    /// The same recipe with another way of choosing features.
+    pub fn with_selection(self, selection: Selection) -> Self {
+        Self { selection, refit: self.refit && selection == Selection::None, ..self }
     }
 
     pub fn descriptors(&self) -> Vec<Descriptor> {

@@ -246,11 +246,8 @@ fn describe_frame(
         describer.describe(descriptor, panorama, &mut properties);
         properties
     };
-    let mut described: Vec<(Vec<f32>, Vec<f32>)> = options
-        .descriptors
-        .iter()
-        .map(|&descriptor| (describe(describer, descriptor, panorama), Vec::new()))
-        .collect();
+    let mut described: Vec<(Vec<f32>, Vec<f32>)> =
+        options.descriptors.iter().map(|&descriptor| (describe(describer, descriptor, panorama), Vec::new())).collect();
     if options.perturbed.is_empty() {
         return described;
     }

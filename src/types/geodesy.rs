@@ -1,5 +1,7 @@
 //! Positions on the Earth: WGS84 and the local ENU frame, by way of ECEF (earth-centred, earth-fixed).
 
+use serde::{Deserialize, Serialize};
+
 use super::PositionM;
 
 /// Semi-major axis of WGS84 \[m\] and flattening: NIMA TR8350.2, table 3.1.
@@ -9,7 +11,7 @@ const FLATTENING: f64 = 1.0 / 298.257_223_563;
 const ECCENTRICITY_SQUARED: f64 = FLATTENING * (2.0 - FLATTENING);
 
 /// A position on WGS84.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Geodetic {
     pub latitude_deg: f64,
     pub longitude_deg: f64,

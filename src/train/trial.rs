@@ -1,15 +1,17 @@
-//! The paper's protocol on one survey: split, learn, select, test.
+//! The paper's protocol on one survey: learn, select, test.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
+use super::group::{LearnError, LearnedGroup};
+use super::recipe::{Recipe, Selection};
+use super::split::Split;
+use super::subset::{LikelihoodTable, backward_elimination, component_median};
+use super::survey::Survey;
 use crate::gp::{GpError, LearningPositions};
 use crate::localize::{FieldOnCells, NoiseModel, most_likely_cell, refined_m};
 use crate::map::{CandidateCells, CellsError};
-use crate::train::{
-    LearnError, LearnedGroup, LikelihoodTable, Recipe, Selection, Split, Survey, backward_elimination,
-};
 use crate::types::PositionM;
 
 /// One way of carrying out the protocol.
@@ -20,6 +22,17 @@ pub struct Trial<'a> {
     pub grid_step_m: f64,
     /// Positions to learn from and to select on, one a frame of the survey.
     pub recorded_m: &'a [PositionM],
+}
+
+/// What a trial brought.
+#[derive(Debug, Clone)]
+pub struct Outcomes {
+    /// One a group, and one of all groups fused if there are several.
+    pub rows: Vec<Outcome>,
+    /// The groups, with the features kept.
+    pub groups: Vec<LearnedGroup>,
+    /// Number of frames they were learned from in the end.
+    pub learned_from: usize,
 }
 
 /// What a trial brought for one row of the table: a group, or all of them fused.
@@ -45,7 +58,7 @@ pub struct Outcome {
 }
 
 #[derive(Debug, thiserror::Error)]
-pub enum ProtocolError {
+pub enum TrialError {
     #[error(transparent)]
     Learn(#[from] LearnError),
     #[error(transparent)]
@@ -54,15 +67,36 @@ pub enum ProtocolError {
     Cells(#[from] CellsError),
     #[error("all {frames} learning images are at one place: there is nothing to localize")]
     OnePlace { frames: usize },
+    #[error(
+        "{learning} learning and {validation} validation images: at least {MIN_LEARNING} and 1 are needed; record more frames"
+    )]
+    TooFewFrames { learning: usize, validation: usize },
+    #[error(
+        "selecting among {features} features on {queries} validation images and {cells} cells needs {gigabytes:.1} GB; \
+         use a larger --grid-step-m"
+    )]
+    TableTooLarge { features: usize, queries: usize, cells: usize, gigabytes: f64 },
+    #[error("the selection kept no feature of any type: none helps on the validation images; use --select none")]
+    NothingKept,
 }
+
+/// Fewer learning images than this have no Gaussian process worth the name.
+const MIN_LEARNING: usize = 3;
+/// A likelihood table larger than this is refused.
+const MAX_TABLE_BYTES: usize = 4 << 30;
 
 /// What a trial is doing, for a progress display.
 #[derive(Debug, Clone, Copy)]
 pub enum Step {
     /// So many features are about to be fitted to this descriptor.
-    Fitting { descriptor: &'static str, features: usize },
+    Fitting {
+        descriptor: &'static str,
+        features: usize,
+    },
     FeatureFitted,
-    Eliminating { features: usize },
+    Eliminating {
+        features: usize,
+    },
     FeatureEliminated,
     Done,
 }
@@ -73,22 +107,54 @@ struct Likelihoods {
     values: Vec<f32>,
 }
 
-/// Runs `trial` on `survey`: one outcome a group, and one of all groups fused if there are several.
-pub fn run(survey: &Survey, trial: &Trial, on_step: impl Fn(Step) + Sync) -> Result<Vec<Outcome>, ProtocolError> {
+/// Runs `trial` on `survey`.
+///
+/// A recipe that refits chooses nothing on the validation frames: once measured on them it learns from them too, and is
+/// tested so.
+pub fn run(survey: &Survey, trial: &Trial, on_step: impl Fn(Step) + Sync) -> Result<Outcomes, TrialError> {
+    let first = run_once(survey, trial, &trial.split.learning, &on_step)?;
+    if !trial.recipe.refit {
+        return Ok(first);
+    }
+    let mut everything_seen = [&trial.split.learning[..], &trial.split.validation].concat();
+    everything_seen.sort_unstable();
+    let mut refitted = run_once(survey, trial, &everything_seen, &on_step)?;
+    for (row, before) in refitted.rows.iter_mut().zip(first.rows) {
+        row.kept_validation_m = before.kept_validation_m;
+    }
+    Ok(refitted)
+}
+
+fn run_once(
+    survey: &Survey,
+    trial: &Trial,
+    learning_rows: &[usize],
+    on_step: &(impl Fn(Step) + Sync),
+) -> Result<Outcomes, TrialError> {
     let at = |rows: &[usize]| -> Vec<PositionM> { rows.iter().map(|&row| trial.recorded_m[row]).collect() };
     let split = trial.split;
-    let learning = LearningPositions::new(at(&split.learning));
+    let learning = LearningPositions::new(at(learning_rows));
+    if learning.len() < MIN_LEARNING || split.validation.is_empty() {
+        return Err(TrialError::TooFewFrames { learning: learning.len(), validation: split.validation.len() });
+    }
     if learning.positions().windows(2).all(|pair| pair[0] == pair[1]) {
-        return Err(ProtocolError::OnePlace { frames: learning.len() });
+        return Err(TrialError::OnePlace { frames: learning.len() });
     }
     let cells = CandidateCells::around(learning.positions(), trial.grid_step_m, None)?;
     let centers_m = cells.centers_m();
     let queries = Queries { survey, trial, validation_m: at(&split.validation) };
-    let estimate = |likelihoods: &Likelihoods| -> Vec<PositionM> {
-        likelihoods.values.chunks_exact(likelihoods.cells).map(|row| locate(&cells, row, trial.recipe.refine)).collect()
+    let median_m = component_median(learning.positions());
+    let estimate = |likelihoods: &Likelihoods, features: usize| -> Vec<PositionM> {
+        let rows = likelihoods.values.chunks_exact(likelihoods.cells);
+        match features {
+            // The empty set answers the median.
+            0 => rows.map(|_| median_m).collect(),
+            _ => rows.map(|row| locate(&cells, row, trial.recipe.refine)).collect(),
+        }
     };
 
     let mut outcomes = Vec::new();
+    let mut groups = Vec::new();
     let mut fused: Option<[Likelihoods; 3]> = None;
     for group_recipe in &trial.recipe.groups {
         let descriptor = group_recipe.descriptor;
@@ -96,14 +162,14 @@ pub fn run(survey: &Survey, trial: &Trial, on_step: impl Fn(Step) + Sync) -> Res
         let group = LearnedGroup::learn(
             *group_recipe,
             &learning,
-            survey.properties(descriptor, &split.learning).as_ref(),
-            survey.changes(descriptor, &split.learning).as_ref(),
+            survey.properties(descriptor, learning_rows).as_ref(),
+            survey.changes(descriptor, learning_rows).as_ref(),
             || on_step(Step::FeatureFitted),
         )?;
         let field = group.on_cells(&learning, &centers_m)?;
         let kept = match trial.recipe.selection {
             Selection::None => (0..group.features()).collect(),
-            Selection::Backward => queries.select(&group, &field, &centers_m, &on_step),
+            Selection::Backward => queries.select(&group, &field, &centers_m, on_step)?,
         };
         let kept_group = group.select(&kept);
         let kept_field = kept_group.on_cells(&learning, &centers_m)?;
@@ -117,9 +183,9 @@ pub fn run(survey: &Survey, trial: &Trial, on_step: impl Fn(Step) + Sync) -> Res
             m: descriptor.dimensions(),
             rank: group.rank,
             kept: kept.len(),
-            all_test_m: estimate(&all_test),
-            kept_test_m: estimate(&kept_test),
-            kept_validation_m: estimate(&kept_validation),
+            all_test_m: estimate(&all_test, group.features()),
+            kept_test_m: estimate(&kept_test, kept.len()),
+            kept_validation_m: estimate(&kept_validation, kept.len()),
             bic_all: bic(&everything),
             bic_kept: bic(&kept),
             warnings: group.warnings(),
@@ -133,25 +199,26 @@ pub fn run(survey: &Survey, trial: &Trial, on_step: impl Fn(Step) + Sync) -> Res
                 }
             }
         }
+        groups.push(kept_group);
         on_step(Step::Done);
     }
     if let (Some([all_test, kept_test, kept_validation]), true) = (fused, outcomes.len() > 1) {
-        let total = |of: fn(&Outcome) -> usize| outcomes.iter().map(of).sum();
+        let total = |of: fn(&Outcome) -> usize| -> usize { outcomes.iter().map(of).sum() };
         let sum = |of: fn(&Outcome) -> Option<f64>| outcomes.iter().map(of).sum();
         outcomes.push(Outcome {
             features: "fused".into(),
             m: total(|outcome| outcome.m),
             rank: total(|outcome| outcome.rank),
             kept: total(|outcome| outcome.kept),
-            all_test_m: estimate(&all_test),
-            kept_test_m: estimate(&kept_test),
-            kept_validation_m: estimate(&kept_validation),
+            all_test_m: estimate(&all_test, total(|outcome| outcome.rank)),
+            kept_test_m: estimate(&kept_test, total(|outcome| outcome.kept)),
+            kept_validation_m: estimate(&kept_validation, total(|outcome| outcome.kept)),
             bic_all: sum(|outcome| outcome.bic_all),
             bic_kept: sum(|outcome| outcome.bic_kept),
             warnings: Vec::new(),
         });
     }
-    Ok(outcomes)
+    Ok(Outcomes { rows: outcomes, groups, learned_from: learning.len() })
 }
 
 /// −2 Σ L(θ_r) + 4 |Ω| log n: the reading of the Bayesian information criterion that fits the paper's tables, four
@@ -181,15 +248,20 @@ impl Queries<'_> {
         field: &FieldOnCells,
         centers_m: &[PositionM],
         on_step: &(impl Fn(Step) + Sync),
-    ) -> Vec<usize> {
+    ) -> Result<Vec<usize>, TrialError> {
         on_step(Step::Eliminating { features: group.features() });
+        let (features, queries, cells) = (group.features(), self.validation_m.len(), centers_m.len());
+        let bytes = features * queries * cells * size_of::<f32>();
+        if bytes > MAX_TABLE_BYTES {
+            return Err(TrialError::TableTooLarge { features, queries, cells, gigabytes: bytes as f64 * 1e-9 });
+        }
         let mut table = LikelihoodTable::new(group.features(), centers_m.to_vec());
         let features = self.features(group, &self.trial.split.validation);
         let rows: Vec<Vec<f32>> = features.par_iter().map(|row| field.log_likelihood_of_each(row)).collect();
         for (row, &truth_m) in rows.into_iter().zip(&self.validation_m) {
             table.push(truth_m, row);
         }
-        backward_elimination(&table, |_| on_step(Step::FeatureEliminated)).best_subset()
+        Ok(backward_elimination(&table, |_| on_step(Step::FeatureEliminated)).best_subset())
     }
 
     fn likelihoods(&self, group: &LearnedGroup, field: &FieldOnCells, rows: &[usize]) -> Likelihoods {

@@ -1,0 +1,133 @@
+//! What `info`, `check` and `train` say about a map.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde_json::json;
+
+use crate::gp::fit::Warning;
+use crate::map::{FeatureMap, GroupInfo};
+use crate::train::GroupHyperparameters;
+
+/// Fits of a group by what they have to say.
+pub fn warnings(group: &GroupInfo) -> BTreeMap<Warning, usize> {
+    let mut counts = BTreeMap::new();
+    if let GroupHyperparameters::Each(fits) = &group.hyperparameters {
+        for &warning in fits.iter().flat_map(|fit| &fit.warnings) {
+            *counts.entry(warning).or_default() += 1;
+        }
+    }
+    counts
+}
+
+pub fn as_json(path: &Path, map: &FeatureMap, size_bytes: u64) -> serde_json::Value {
+    json!({
+        "file": path,
+        "kind": "map",
+        "size_bytes": size_bytes,
+        "learning_positions": map.positions_m.len(),
+        "cells": map.cells.len(),
+        "info": map.info,
+    })
+}
+
+pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {
+    let info = &map.info;
+    let mut lines: Vec<(&str, String)> = vec![
+        ("map", format!("{}, version {}, by omniloc {}", path.display(), info.format_version, info.program)),
+        ("size", format!("{:.1} MB", size_bytes as f64 * 1e-6)),
+    ];
+    for recording in &info.recordings {
+        lines.push(("trained on", format!("{}, {} frames", recording.name, recording.frames)));
+    }
+    let selection = if info.groups.iter().any(|group| group.features < group.rank) { "chosen" } else { "all kept" };
+    lines.push(("recipe", format!("{}, features {selection}", info.recipe.name())));
+    let (columns, rows) = (f64::from(info.grid.columns), f64::from(info.grid.rows));
+    lines.push((
+        "cells",
+        format!(
+            "{} of {columns} x {rows}, {} m apart, over {:.1} x {:.1} m",
+            map.cells.len(),
+            info.grid.step_m,
+            (columns - 1.0) * info.grid.step_m,
+            (rows - 1.0) * info.grid.step_m
+        ),
+    ));
+    let donut = &info.calibration;
+    lines.push((
+        "lens",
+        format!(
+            "donut, centre ({:.1}, {:.1}), radii {:.1} .. {:.1} px in {} x {} px",
+            donut.center_x_px,
+            donut.center_y_px,
+            donut.inner_radius_px,
+            donut.outer_radius_px,
+            info.image_size_px[0],
+            info.image_size_px[1]
+        ),
+    ));
+    lines.push((
+        "origin",
+        match info.origin {
+            Some(o) => format!("{:.7}, {:.7} deg, {:.1} m", o.latitude_deg, o.longitude_deg, o.altitude_m),
+            None => "unknown: positions are local metres".into(),
+        },
+    ));
+    let mut text: String = lines.iter().map(|(label, text)| format!("{label:<15}{text}\n")).collect();
+
+    text += &format!("\n{:<19} {:>5} {:>5} {:>5}  hyperparameters\n", "features", "m", "rank", "kept");
+    for group in &info.groups {
+        let descriptor = group.recipe.descriptor;
+        text += &format!(
+            "{:<19} {:>5} {:>5} {:>5}  {}\n",
+            descriptor.name(),
+            descriptor.dimensions(),
+            group.rank,
+            group.features,
+            hyperparameters(&group.hyperparameters)
+        );
+        for (warning, count) in warnings(group) {
+            text += &format!("{:<19} {count} of {}: {}\n", "", group.features, warning.describe());
+        }
+    }
+    text += &format!(
+        "\n{:<19} {:>7} {:>7} {:>7} {:>7}   on {} frames held back\n",
+        "validation",
+        "RMSE",
+        "median",
+        "P95",
+        ">10 m",
+        info.validation.first().map_or(0, |figures| figures.frames)
+    );
+    for figures in &info.validation {
+        text += &format!(
+            "{:<19} {:>6.2}m {:>6.2}m {:>6.2}m {:>6.1}%\n",
+            figures.features,
+            figures.rmse_m,
+            figures.median_m,
+            figures.p95_m,
+            100.0 * figures.share_over_10m
+        );
+    }
+    text
+}
+
+fn hyperparameters(hyperparameters: &GroupHyperparameters) -> String {
+    match hyperparameters {
+        GroupHyperparameters::Shared(shared) => format!(
+            "shared: length {:.2} m, signal {:.2}, noise {:.2}",
+            shared.length_scale_m[0], shared.signal_std, shared.noise_std
+        ),
+        GroupHyperparameters::Each(fits) => {
+            let mut lengths_m: Vec<f64> = fits.iter().flat_map(|fit| fit.hyperparameters.length_scale_m).collect();
+            lengths_m.sort_by(f64::total_cmp);
+            let at = |quantile: f64| lengths_m.get((quantile * (lengths_m.len() - 1) as f64) as usize).copied();
+            match (at(0.1), at(0.5), at(0.9)) {
+                (Some(low), Some(middle), Some(high)) => {
+                    format!("one set a feature: lengths {low:.2} .. {middle:.2} .. {high:.2} m (P10, P50, P90)")
+                }
+                _ => "none".into(),
+            }
+        }
+    }
+}

@@ -1,0 +1,109 @@
+//! Opening recordings for training and evaluation.
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+
+use super::options::check_input;
+use super::progress::Progress;
+use crate::features::Descriptor;
+use crate::recording::Recording;
+use crate::train::{PERTURBED_COPIES, Recipe, Survey, SurveyOptions};
+use crate::types::PositionM;
+
+/// Opens `paths`, all of which must be usable.
+pub fn open_recordings(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
+    paths
+        .iter()
+        .map(|path| {
+            check_input(path)?;
+            let recording = Recording::open(path)?;
+            let unusable = recording.unusable.len();
+            if unusable > 0 {
+                eprintln!("note: {}: {unusable} frames without a usable position are left out", path.display());
+            }
+            Ok(recording)
+        })
+        .collect()
+}
+
+/// Reads what learning by `recipes` needs of all frames.
+pub fn read_to_learn(
+    recordings: &[Recording],
+    recipes: &[Recipe],
+    fixed: bool,
+    progress: &Progress,
+) -> anyhow::Result<Survey> {
+    let descriptors = recipes.iter().flat_map(Recipe::descriptors).collect();
+    let perturbed = recipes.iter().flat_map(Recipe::perturbed).collect();
+    read(recordings, descriptors, perturbed, fixed, progress)
+}
+
+/// Reads what matching all frames against a map with these `descriptors` needs.
+pub fn read_to_match(
+    recording: &Recording,
+    descriptors: Vec<Descriptor>,
+    progress: &Progress,
+) -> anyhow::Result<Survey> {
+    read(std::slice::from_ref(recording), descriptors, Vec::new(), false, progress)
+}
+
+fn read(
+    recordings: &[Recording],
+    mut descriptors: Vec<Descriptor>,
+    perturbed: Vec<Descriptor>,
+    fixed: bool,
+    progress: &Progress,
+) -> anyhow::Result<Survey> {
+    descriptors.sort_unstable();
+    descriptors.dedup();
+    let options = SurveyOptions { descriptors, fixed, repetitions: PERTURBED_COPIES, perturbed, seed: 0 };
+    let frames = recordings.iter().map(|recording| recording.survey.len()).sum();
+    progress.begin(if fixed { "reading frames, turned by their yaw" } else { "reading frames" }, frames);
+    Ok(Survey::read(recordings, &options, |frames| progress.advance(frames))?)
+}
+
+/// The grid step for an area when none is asked for: 0.1 m where the positions lie within a room, 1 m outdoors.
+pub fn default_grid_step_m(positions_m: &[PositionM]) -> f64 {
+    const ROOM_M: f64 = 20.0;
+    let extent_m = crate::gp::fit::extent_m(positions_m);
+    if extent_m[0].hypot(extent_m[1]) < ROOM_M { 0.1 } else { 1.0 }
+}
+
+/// A feature type, as an argument.
+pub fn parse_descriptor(name: &str) -> Result<Descriptor, String> {
+    name.parse().map_err(|error: crate::features::UnknownDescriptor| error.to_string())
+}
+
+/// Positions from a CSV `index,x_m,y_m`, one for every frame of `survey`.
+pub fn read_truth(path: &std::path::Path, survey: &Survey) -> anyhow::Result<Vec<PositionM>> {
+    check_input(path)?;
+    let context = || format!("reading the truth {}", path.display());
+    let mut csv = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).with_context(context)?;
+    let header = csv.headers().with_context(context)?;
+    if header != vec!["index", "x_m", "y_m"] {
+        let found = header.iter().collect::<Vec<_>>().join(",");
+        anyhow::bail!("{}: line 1: header is `{found}`, expected `index,x_m,y_m`", path.display());
+    }
+    let mut truth = std::collections::HashMap::new();
+    for record in csv.records() {
+        let record = record.with_context(context)?;
+        let line = record.position().map_or(0, |position| position.line());
+        let number = |i: usize, name: &str| {
+            let value: Option<f64> = record[i].parse().ok().filter(|value: &f64| value.is_finite());
+            value.with_context(|| {
+                format!("{}: line {line}: {name} is `{}`, expected a finite number", path.display(), &record[i])
+            })
+        };
+        let index: usize = record[0].parse().with_context(|| {
+            format!("{}: line {line}: index is `{}`, expected a whole number", path.display(), &record[0])
+        })?;
+        if truth.insert(index, [number(1, "x_m")?, number(2, "y_m")?]).is_some() {
+            anyhow::bail!("{}: line {line}: index {index} was given before", path.display());
+        }
+    }
+    let of_frame = |index: usize| {
+        truth.get(&index).copied().with_context(|| format!("{}: no line for frame {index}", path.display()))
+    };
+    survey.frames.iter().map(|frame| of_frame(frame.index)).collect()
+}

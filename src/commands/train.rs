@@ -1,0 +1,80 @@
+//! `omniloc train`: recordings become a map.
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use super::map_report;
+use super::options::{OutputKind, check_output};
+use super::progress::Progress;
+use super::survey::{default_grid_step_m, open_recordings, parse_descriptor, read_to_learn};
+use super::{DONE, print};
+use crate::features::Descriptor;
+use crate::map::file;
+use crate::recording::{RecordingError, write_file_atomically};
+use crate::train::{Recipe, RecipeName, Selection, SplitKind, TrainSettings, train};
+
+/// Turn recordings of a place into a map
+///
+/// A quarter of the frames is first held back to choose features and to measure on; the map is then of all frames. The
+/// default recipe is the one that measures best; `paper` is Do et al. (2015) to the letter.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Recordings of the place, all with the same lens
+    #[arg(required = true, value_name = "REC.mcap")]
+    pub recordings: Vec<PathBuf>,
+    /// The map to write
+    #[arg(long, value_name = "AREA.map")]
+    pub out: PathBuf,
+    #[arg(long, value_enum, default_value = "default")]
+    pub recipe: RecipeName,
+    /// Feature types, in place of the recipe's own: fft, hist, hist-sqrt, sp, sp-log, sp-energy, gradient,
+    /// gradient-unsigned, gradient-coarse
+    #[arg(long, value_delimiter = ',', value_parser = parse_descriptor)]
+    pub features: Vec<Descriptor>,
+    /// How features are chosen [default: backward for the paper's recipe, none for the default one]
+    #[arg(long, value_enum)]
+    pub select: Option<Selection>,
+    /// How the frames held back are drawn
+    #[arg(long, value_enum, default_value = "random")]
+    pub split: SplitKind,
+    /// Seed of the split
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Distance of neighbouring candidate cells [m; default: 1 outdoors, 0.1 where the positions lie within 20 m]
+    #[arg(long, value_name = "M")]
+    pub grid_step_m: Option<f64>,
+    /// Candidate cells are at most this far from a learning position [m; default: 7 times the positions' spacing]
+    #[arg(long, value_name = "M")]
+    pub within_m: Option<f64>,
+    /// Replace the output if it exists
+    #[arg(long)]
+    pub force: bool,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    check_output(&args.out, OutputKind::File, args.force)?;
+    let recipe = Recipe::new(args.recipe, &args.features);
+    let recipe = match args.select {
+        Some(selection) => recipe.with_selection(selection),
+        None => recipe,
+    };
+    let recordings = open_recordings(&args.recordings)?;
+    let progress = Progress::new();
+    let survey = read_to_learn(&recordings, std::slice::from_ref(&recipe), false, &progress)?;
+    let settings = TrainSettings {
+        split: args.split,
+        seed: args.seed,
+        grid_step_m: args.grid_step_m.unwrap_or_else(|| default_grid_step_m(&survey.positions_m())),
+        within_m: args.within_m,
+    };
+    let sources: Vec<String> = recordings.iter().map(|recording| recording.name.clone()).collect();
+    let map = train(&survey, &sources, &recipe, &settings, |step| progress.step("training", step))?;
+    let bytes = file::to_bytes(&map);
+    write_file_atomically(&args.out, |out| {
+        out.write_all(&bytes).map_err(|cause| RecordingError::CannotWrite { path: args.out.clone(), cause })
+    })?;
+    progress.finish();
+    print(&map_report::as_text(&args.out, &map, bytes.len() as u64))?;
+    Ok(DONE.into())
+}

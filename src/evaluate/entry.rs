@@ -1,0 +1,269 @@
+//! Results as they are printed and written: one entry a recipe, type of features, split and seed.
+
+use serde::Serialize;
+
+use super::ErrorFigures;
+use crate::types::PositionM;
+
+/// One row of the evaluation. The names are a contract with scripts: keys are added, never renamed; `null` where a
+/// figure has no meaning.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Entry {
+    pub dataset: String,
+    pub recipe: Option<&'static str>,
+    pub features: String,
+    pub estimator: &'static str,
+    pub split: Option<String>,
+    pub seed: Option<u64>,
+    pub noisy: bool,
+    pub fixed: bool,
+    pub n_learning: usize,
+    pub n_validation: usize,
+    pub n_test: usize,
+    /// Frames the tested model was learned from: with the validation frames where the recipe refits.
+    pub n_learned_from: usize,
+    pub m: Option<usize>,
+    pub rank: Option<usize>,
+    pub kept: Option<usize>,
+    pub compression: Option<f64>,
+    pub rmse_all_test_m: Option<f64>,
+    pub rmse_be_validation_m: Option<f64>,
+    pub rmse_be_test_m: Option<f64>,
+    pub emax_test_m: Option<f64>,
+    pub rmse_m: Option<f64>,
+    pub median_m: Option<f64>,
+    pub p90_m: Option<f64>,
+    pub p95_m: Option<f64>,
+    pub share_over_10m: Option<f64>,
+    pub skill: Option<f64>,
+    pub heading_median_deg: Option<f64>,
+    pub nees_mean: Option<f64>,
+    pub coverage_95: Option<f64>,
+    pub bic_all: Option<f64>,
+    pub bic_kept: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frames: Option<Vec<FrameEntry>>,
+}
+
+/// One frame's estimate.
+#[derive(Debug, Clone, Serialize)]
+pub struct FrameEntry {
+    pub index: usize,
+    pub truth_e_m: f64,
+    pub truth_n_m: f64,
+    pub est_e_m: f64,
+    pub est_n_m: f64,
+    pub cov_ee_m2: Option<f64>,
+    pub cov_en_m2: Option<f64>,
+    pub cov_nn_m2: Option<f64>,
+    pub heading_rad: Option<f64>,
+    pub state: Option<&'static str>,
+}
+
+impl Entry {
+    /// The figures of the estimate that the recipe stands for.
+    pub fn with_figures(self, figures: Option<ErrorFigures>) -> Self {
+        Self {
+            rmse_m: figures.map(|f| f.rmse_m),
+            median_m: figures.map(|f| f.median_m),
+            p90_m: figures.map(|f| f.p90_m),
+            p95_m: figures.map(|f| f.p95_m),
+            share_over_10m: figures.map(|f| f.share_over_10m),
+            skill: figures.map(|f| f.skill),
+            emax_test_m: figures.map(|f| f.max_m),
+            ..self
+        }
+    }
+
+    /// The frames with their estimates.
+    pub fn with_frames(self, indices: &[usize], truth_m: &[PositionM], estimates_m: &[PositionM]) -> Self {
+        let frames = indices.iter().zip(truth_m).zip(estimates_m).map(|((&index, truth_m), estimate_m)| FrameEntry {
+            index,
+            truth_e_m: truth_m[0],
+            truth_n_m: truth_m[1],
+            est_e_m: estimate_m[0],
+            est_n_m: estimate_m[1],
+            cov_ee_m2: None,
+            cov_en_m2: None,
+            cov_nn_m2: None,
+            heading_rad: None,
+            state: None,
+        });
+        Self { frames: Some(frames.collect()), ..self }
+    }
+
+    /// What entries have in common that are averaged over seeds.
+    pub fn row_key(&self) -> (String, Option<&'static str>, bool, bool, String) {
+        let split = self.split.clone().unwrap_or_default();
+        (split, self.recipe, self.noisy, self.fixed, self.features.clone())
+    }
+}
+
+/// The entries as a text table, seeds averaged: the shape of the paper's Tables 1 and 2, and beside it what tells more.
+pub fn table(entries: &[Entry]) -> String {
+    let mut keys = Vec::new();
+    for entry in entries {
+        if !keys.contains(&entry.row_key()) {
+            keys.push(entry.row_key());
+        }
+    }
+    let mut text = String::new();
+    let mut split_before = None;
+    for key in keys {
+        let rows: Vec<&Entry> = entries.iter().filter(|entry| entry.row_key() == key).collect();
+        if split_before.as_ref() != Some(&key.0) {
+            text += &heading(rows[0], rows.len());
+            split_before = Some(key.0.clone());
+        }
+        text += &line(&rows);
+    }
+    text
+}
+
+fn heading(first: &Entry, seeds: usize) -> String {
+    let counts =
+        format!("{} learning, {} validation, {} test frames", first.n_learning, first.n_validation, first.n_test);
+    let title = match (&first.split, seeds) {
+        (Some(split), 1) => format!("{split} split: {counts}"),
+        (Some(split), _) => format!("{split} split: {counts}, mean over {seeds} seeds"),
+        (None, _) => format!("against a map: {} frames", first.n_test),
+    };
+    format!(
+        "\n{title}\n{:8} {:19} {:>5} {:>5} {:>12} {:>7} {:>7} {:>7} {:>7} | {:>7} {:>7} {:>7} {:>7} {:>6} {:>6} | {:>8} {:>8}\n",
+        "recipe",
+        "features",
+        "m",
+        "rank",
+        "kept",
+        "all T",
+        "BE V",
+        "BE T",
+        "e_max",
+        "RMSE",
+        "median",
+        "P90",
+        "P95",
+        ">10 m",
+        "skill",
+        "BIC all",
+        "BIC kept"
+    )
+}
+
+fn line(rows: &[&Entry]) -> String {
+    let first = rows[0];
+    let mean = |of: &dyn Fn(&Entry) -> Option<f64>| -> Option<f64> {
+        let values: Option<Vec<f64>> = rows.iter().map(|entry| of(entry)).collect();
+        values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
+    };
+    let number = |value: Option<f64>, width: usize, decimals: usize| match value {
+        Some(value) => format!("{value:>width$.decimals$}"),
+        None => format!("{:>width$}", "-"),
+    };
+    let meters = |of: &dyn Fn(&Entry) -> Option<f64>| {
+        let value = mean(of);
+        let decimals = if value.is_some_and(|v| v.abs() < 9.995) { 2 } else { 1 };
+        number(value, 7, decimals)
+    };
+    let count = |of: fn(&Entry) -> Option<usize>| mean(&|entry| of(entry).map(|n| n as f64));
+    let kept = match (count(|e| e.kept), mean(&|e| e.compression)) {
+        (Some(kept), Some(compression)) => format!("{kept:.0} ({compression:.1})"),
+        (Some(kept), None) => format!("{kept:.0}"),
+        _ => "-".into(),
+    };
+    let variant = match (first.noisy, first.fixed) {
+        (true, _) => " (noisy)",
+        (_, true) => " (fixed)",
+        _ => "",
+    };
+    format!(
+        "{:8} {:19} {} {} {kept:>12} {} {} {} {} | {} {} {} {} {} {} | {} {}\n",
+        first.recipe.unwrap_or("-"),
+        format!("{}{variant}", first.features),
+        number(count(|e| e.m), 5, 0),
+        number(count(|e| e.rank), 5, 0),
+        meters(&|e| e.rmse_all_test_m),
+        meters(&|e| e.rmse_be_validation_m),
+        meters(&|e| e.rmse_be_test_m),
+        meters(&|e| e.emax_test_m),
+        meters(&|e| e.rmse_m),
+        meters(&|e| e.median_m),
+        meters(&|e| e.p90_m),
+        meters(&|e| e.p95_m),
+        number(mean(&|e| e.share_over_10m.map(|share| 100.0 * share)), 5, 1) + "%",
+        number(mean(&|e| e.skill), 6, 2),
+        number(mean(&|e| e.bic_all), 8, 0),
+        number(mean(&|e| e.bic_kept), 8, 0),
+    )
+}
+
+/// What the columns mean, for under the tables.
+pub const LEGEND: &str = "\
+All errors in metres. m properties, rank after scaling, kept by the selection (m / kept). RMSE: all T with all features on
+the test frames; BE V and BE T with the features kept, on validation and test frames; e_max the largest test error.
+Right of the bar, the estimate the recipe stands for. skill: 1 - RMSE / RMSE of always answering the median position;
+1 is perfect, 0 knows nothing. The validation figures are of frames that features were chosen on: they flatter.
+";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn entry(seed: u64, rmse_m: f64) -> Entry {
+        Entry {
+            recipe: Some("paper"),
+            features: "fft".into(),
+            estimator: "single",
+            split: Some("random".into()),
+            seed: Some(seed),
+            m: Some(128),
+            rmse_m: Some(rmse_m),
+            ..Entry::default()
+        }
+    }
+
+    #[test]
+    fn seeds_are_averaged_into_one_row() {
+        let text = table(&[entry(0, 1.0), entry(1, 3.0)]);
+        assert!(text.contains("mean over 2 seeds") && text.contains("2.00") && text.lines().count() == 4, "{text}");
+    }
+
+    #[test]
+    fn the_contract_s_keys_are_there_and_null_where_they_mean_nothing() {
+        let json = serde_json::to_value(entry(0, 1.0)).expect("plain data");
+        for key in [
+            "recipe",
+            "features",
+            "estimator",
+            "split",
+            "seed",
+            "noisy",
+            "fixed",
+            "n_learning",
+            "n_validation",
+            "n_test",
+            "m",
+            "rank",
+            "kept",
+            "compression",
+            "rmse_all_test_m",
+            "rmse_be_validation_m",
+            "rmse_be_test_m",
+            "emax_test_m",
+            "rmse_m",
+            "median_m",
+            "p90_m",
+            "p95_m",
+            "share_over_10m",
+            "skill",
+            "heading_median_deg",
+            "nees_mean",
+            "coverage_95",
+            "bic_all",
+            "bic_kept",
+        ] {
+            assert!(json.get(key).is_some(), "{key} is missing");
+        }
+        assert!(json["nees_mean"].is_null() && json.get("frames").is_none());
+    }
+}
