@@ -3,15 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use omniloc::commands::{BAD_ARGUMENTS, BadArgument, Command, FAILED};
-
-/// Tells a vehicle where it is from one omnidirectional camera
-#[derive(Debug, Parser)]
-#[command(version)]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
+use omniloc::commands::{BAD_ARGUMENTS, BadArgument, Cli, FAILED};
 
 fn main() -> ExitCode {
     match Cli::parse().command.run() {

@@ -70,7 +70,7 @@ fn an_existing_calibration_is_replaced_only_when_forced() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let out = folder.path().join("donut.json");
     std::fs::write(&out, "mine").expect("a file");
-    calibrate(&[&data("courtyard")], folder.path()).assert().code(1);
+    calibrate(&[&data("courtyard")], folder.path()).assert().code(2);
     assert_eq!(std::fs::read_to_string(&out).expect("still there"), "mine");
     calibrate(&[&data("courtyard")], folder.path()).arg("--force").assert().code(0);
     assert!((calibration(&out).outer_radius_px - 312.0).abs() < 0.3);

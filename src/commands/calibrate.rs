@@ -7,8 +7,10 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use serde_json::json;
 
-use super::frame_source;
+use super::options::{OutputKind, check_output};
+use super::{BadArgument, frame_source, print};
 use crate::calibrate::{DonutEstimate, DonutFinder, FindDonutError, Orientation, Verdict, overlay};
+use crate::recording::{RecordingError, write_file_atomically};
 use crate::types::{AzimuthSense, DonutCalibration, LumaImage};
 
 /// Find the donut in camera images: centre and radii
@@ -75,15 +77,11 @@ struct Outcome {
 /// # Errors
 /// No donut, unreadable input, or files that exist or cannot be written.
 pub fn run(args: &CalibrateArgs) -> anyhow::Result<ExitCode> {
-    if !args.force {
-        for path in [&args.out, &args.overlay] {
-            if path.exists() {
-                bail!("{} exists; --force replaces it", path.display());
-            }
-        }
+    for path in [&args.out, &args.overlay] {
+        check_output(path, OutputKind::File, args.force)?;
     }
     if let Some(angle) = args.start_angle.filter(|angle| !angle.is_finite()) {
-        bail!("--start-angle is {angle}, expected a finite number");
+        return Err(BadArgument(format!("--start-angle is {angle}, expected a finite number")).into());
     }
     let source = frame_source::open(&args.input, args.frames as usize)?;
     let existing = source.calibration;
@@ -102,12 +100,12 @@ pub fn run(args: &CalibrateArgs) -> anyhow::Result<ExitCode> {
         let mut text = serde_json::to_string_pretty(&outcome.calibration).context("encoding the calibration")?;
         text.push('\n');
         // The calibration last: where it is, the picture is too.
-        write_whole(&args.overlay, png.get_ref(), args.force)?;
-        write_whole(&args.out, text.as_bytes(), args.force)?;
+        write_whole(&args.overlay, png.get_ref())?;
+        write_whole(&args.out, text.as_bytes())?;
         outcome.written = vec![args.out.clone(), args.overlay.clone()];
     }
     let report = if args.json { format!("{:#}\n", json_report(&outcome)) } else { text_report(&outcome, accepted) };
-    std::io::stdout().write_all(report.as_bytes()).context("writing to stdout")?;
+    print(&report)?;
     Ok(if accepted { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
@@ -162,15 +160,10 @@ fn cut_rim_px(donut: &DonutCalibration, frame: &LumaImage) -> Option<f64> {
     Some(beyond(donut.center_x_px, frame.width_px).max(beyond(donut.center_y_px, frame.height_px)))
 }
 
-/// Writes beside the target and renames, so that there is never half a file.
-fn write_whole(path: &Path, bytes: &[u8], force: bool) -> anyhow::Result<()> {
-    let context = || format!("writing {}", path.display());
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut file = tempfile::NamedTempFile::new_in(folder).with_context(context)?;
-    file.write_all(bytes).with_context(context)?;
-    file.as_file().sync_all().with_context(context)?;
-    let persisted = if force { file.persist(path).map(drop) } else { file.persist_noclobber(path).map(drop) };
-    persisted.map_err(|error| error.error).with_context(context)
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), RecordingError> {
+    write_file_atomically(path, |out| {
+        out.write_all(bytes).map_err(|cause| RecordingError::CannotWrite { path: path.into(), cause })
+    })
 }
 
 /// Distance of the centres and change of the radii \[px\].

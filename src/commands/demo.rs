@@ -7,7 +7,7 @@ use std::time::Instant;
 use anyhow::Context;
 use clap::Parser;
 
-use super::{BadArgument, Command, DONE, print};
+use super::{BadArgument, Cli, DONE, print};
 
 /// Import, train and evaluate on a small sample of real photographs
 ///
@@ -25,13 +25,6 @@ pub struct Args {
 
 /// Name of the sample's folder.
 const SAMPLE: &str = "samples/courtyard-75";
-
-/// The command line, for the commands that the demo runs: they are exactly those a user would type.
-#[derive(Debug, Parser)]
-struct Line {
-    #[command(subcommand)]
-    command: Command,
-}
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let start = Instant::now();
@@ -64,10 +57,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(DONE.into())
 }
 
-/// Says what is done, shows the command, and runs it.
+/// Says what is done, shows the command, and runs exactly what a user would type.
 fn step(what: &str, arguments: &[&str]) -> anyhow::Result<()> {
     print(&format!("\n# {what}\n$ omniloc {}\n", arguments.join(" ")))?;
-    let line = Line::try_parse_from(std::iter::once("omniloc").chain(arguments.iter().copied()))?;
+    let line = Cli::try_parse_from(std::iter::once("omniloc").chain(arguments.iter().copied()))?;
     line.command.run()?;
     Ok(())
 }

@@ -9,7 +9,9 @@ use serde_json::json;
 
 use super::options::check_input;
 use super::progress::Progress;
-use super::survey::{default_grid_step_m, open_recordings, parse_descriptor, read_to_learn, read_to_match, read_truth};
+use super::survey::{
+    bad_argument, default_grid_step_m, open_recordings, parse_descriptor, read_to_learn, read_to_match, read_truth,
+};
 use super::{BadArgument, DONE, print};
 use crate::evaluate::{Entry, ErrorFigures, LEGEND, against_map, table};
 use crate::features::Descriptor;
@@ -266,7 +268,7 @@ fn trial_entries(
             None => recipe.name.name().to_owned(),
         };
         let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &recorded_m };
-        let outcomes = run_trial(survey, &trial, |step| progress.step(&part, step))?;
+        let outcomes = run_trial(survey, &trial, |step| progress.step(&part, step)).map_err(bad_argument)?;
         for outcome in &outcomes.rows {
             let base = Entry { n_learned_from: outcomes.learned_from, ..base.clone() };
             let entry = outcome_entry(base, recipe, outcome, &validation_m, &test_m);

@@ -2,6 +2,7 @@
 
 pub mod calibrate;
 pub mod check;
+pub mod completions;
 pub mod demo;
 pub mod evaluate;
 pub mod export;
@@ -9,6 +10,7 @@ pub mod file_kind;
 pub mod frame_source;
 pub mod import;
 pub mod info;
+pub mod man;
 pub mod map_report;
 pub mod options;
 pub mod progress;
@@ -20,7 +22,7 @@ use std::{
     process::ExitCode,
 };
 
-use clap::Subcommand;
+use clap::{CommandFactory, Parser, Subcommand};
 
 /// Done.
 pub const DONE: u8 = 0;
@@ -28,6 +30,17 @@ pub const DONE: u8 = 0;
 pub const FAILED: u8 = 1;
 /// Bad arguments or a bad configuration file.
 pub const BAD_ARGUMENTS: u8 = 2;
+
+/// Tells a vehicle where it is from one omnidirectional camera
+///
+/// Your own data in three commands: omniloc import FOLDER --out drive.mcap; omniloc train drive.mcap --out area.map;
+/// omniloc evaluate drive.mcap. Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done but data was lost.
+#[derive(Debug, Parser)]
+#[command(name = "omniloc", version)]
+pub struct Cli {
+    #[command(subcommand)]
+    pub command: Command,
+}
 
 #[derive(Debug, Subcommand)]
 pub enum Command {
@@ -39,6 +52,8 @@ pub enum Command {
     Export(export::Args),
     Info(info::Args),
     Check(check::Args),
+    Completions(completions::Args),
+    Man(man::Args),
 }
 
 impl Command {
@@ -52,6 +67,8 @@ impl Command {
             Self::Export(args) => export::run(args),
             Self::Info(args) => info::run(args),
             Self::Check(args) => check::run(args),
+            Self::Completions(args) => completions::run(args, Cli::command()),
+            Self::Man(args) => man::run(args, Cli::command()),
         }
     }
 }

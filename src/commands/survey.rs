@@ -4,11 +4,12 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 
+use super::BadArgument;
 use super::options::check_input;
 use super::progress::Progress;
 use crate::features::Descriptor;
 use crate::recording::Recording;
-use crate::train::{PERTURBED_COPIES, Recipe, Survey, SurveyOptions};
+use crate::train::{PERTURBED_COPIES, Recipe, Survey, SurveyOptions, TrialError};
 use crate::types::PositionM;
 
 /// Opens `paths`, all of which must be usable.
@@ -61,6 +62,14 @@ fn read(
     let frames = recordings.iter().map(|recording| recording.survey.len()).sum();
     progress.begin(if fixed { "reading frames, turned by their yaw" } else { "reading frames" }, frames);
     Ok(Survey::read(recordings, &options, |frames| progress.advance(frames))?)
+}
+
+/// A grid that cannot be is the caller's mistake.
+pub fn bad_argument(error: TrialError) -> anyhow::Error {
+    match error {
+        TrialError::Cells(_) | TrialError::TableTooLarge { .. } => BadArgument(error.to_string()).into(),
+        other => other.into(),
+    }
 }
 
 /// The grid step for an area when none is asked for: 0.1 m where the positions lie within a room, 1 m outdoors.

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use super::map_report;
 use super::options::{OutputKind, check_output};
 use super::progress::Progress;
-use super::survey::{default_grid_step_m, open_recordings, parse_descriptor, read_to_learn};
+use super::survey::{bad_argument, default_grid_step_m, open_recordings, parse_descriptor, read_to_learn};
 use super::{DONE, print};
 use crate::features::Descriptor;
 use crate::map::file;
@@ -69,7 +69,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         within_m: args.within_m,
     };
     let sources: Vec<String> = recordings.iter().map(|recording| recording.name.clone()).collect();
-    let map = train(&survey, &sources, &recipe, &settings, |step| progress.step("training", step))?;
+    let map =
+        train(&survey, &sources, &recipe, &settings, |step| progress.step("training", step)).map_err(bad_argument)?;
     let bytes = file::to_bytes(&map);
     write_file_atomically(&args.out, |out| {
         out.write_all(&bytes).map_err(|cause| RecordingError::CannotWrite { path: args.out.clone(), cause })

@@ -129,7 +129,7 @@ fn heading(first: &Entry, seeds: usize) -> String {
         (None, _) => format!("against a map: {} frames", first.n_test),
     };
     format!(
-        "\n{title}\n{:8} {:19} {:>5} {:>5} {:>12} {:>7} {:>7} {:>7} {:>7} | {:>7} {:>7} {:>7} {:>7} {:>6} {:>6} | {:>8} {:>8}\n",
+        "\n{title}\n{:8} {:26} {:>5} {:>5} {:>12} {:>7} {:>7} {:>7} {:>7} | {:>7} {:>7} {:>7} {:>7} {:>6} {:>6} | {:>8} {:>8}\n",
         "recipe",
         "features",
         "m",
@@ -157,6 +157,8 @@ fn line(rows: &[&Entry]) -> String {
         values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
     };
     let number = |value: Option<f64>, width: usize, decimals: usize| match value {
+        // Rounded to zero is zero, without a sign.
+        Some(value) if value.abs() < 0.5 * 10.0_f64.powi(-(decimals as i32)) => format!("{:>width$.decimals$}", 0.0),
         Some(value) => format!("{value:>width$.decimals$}"),
         None => format!("{:>width$}", "-"),
     };
@@ -177,7 +179,7 @@ fn line(rows: &[&Entry]) -> String {
         _ => "",
     };
     format!(
-        "{:8} {:19} {} {} {kept:>12} {} {} {} {} | {} {} {} {} {} {} | {} {}\n",
+        "{:8} {:26} {} {} {kept:>12} {} {} {} {} | {} {} {} {} {} {} | {} {}\n",
         first.recipe.unwrap_or("-"),
         format!("{}{variant}", first.features),
         number(count(|e| e.m), 5, 0),

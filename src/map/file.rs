@@ -308,10 +308,10 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_flipped_bit_is_noticed(at in any::<prop::sample::Index>(), bit in 0..8) {
+        fn a_flipped_bit_is_noticed(at in any::<prop::sample::Index>(), bit in 0_u32..8) {
             let mut bytes = to_bytes(&small_map());
             let at = at.index(bytes.len());
-            bytes[at] ^= 1 << bit;
+            bytes[at] ^= 1_u8 << bit;
             // White space in the header's padding is all that may differ.
             if let Ok(map) = from_bytes(&bytes) {
                 prop_assert_eq!(to_bytes(&map), to_bytes(&small_map()));

@@ -1,0 +1,242 @@
+//! train, evaluate, info and check of maps as a user runs them, on the real photographs of the sample.
+
+mod common;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use common::{DONUT, TinyDataset, jpeg, omniloc, run};
+use tempfile::TempDir;
+
+fn sample() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/courtyard-75")
+}
+
+/// A recording of the sample's first `frames` photographs.
+fn recording(folder: &TempDir, frames: usize) -> PathBuf {
+    let dataset = folder.path().join("courtyard");
+    fs::create_dir_all(dataset.join("images")).expect("a folder");
+    let rows = fs::read_to_string(sample().join("positions.csv")).expect("the sample is shipped");
+    let kept: Vec<&str> = rows.lines().take(1 + frames).collect();
+    fs::write(dataset.join("positions.csv"), kept.join("\n") + "\n").expect("writes");
+    for index in 0..frames {
+        let name = format!("images/{index:04}.jpg");
+        fs::copy(sample().join(&name), dataset.join(&name)).expect("copies");
+    }
+    fs::copy(sample().join("donut.json"), dataset.join("donut.json")).expect("copies");
+    let out = folder.path().join("courtyard.mcap");
+    omniloc().arg("import").arg(&dataset).arg("--out").arg(&out).assert().success();
+    out
+}
+
+fn folder() -> TempDir {
+    TempDir::new().expect("a temporary folder")
+}
+
+#[test]
+fn a_map_is_trained_shown_checked_and_measured_against() {
+    let folder = folder();
+    let recording = recording(&folder, 24);
+    let map = folder.path().join("area.map");
+    let (code, stdout, stderr) =
+        run(omniloc().arg("train").arg(&recording).arg("--out").arg(&map).args(["--grid-step-m", "5"]));
+    assert_eq!(code, 0, "{stderr}");
+    assert!(stdout.contains("trained on     courtyard, 24 frames") && stdout.contains("validation"), "{stdout}");
+
+    let (code, stdout, _) = run(omniloc().arg("info").arg("--json").arg(&map));
+    let info: serde_json::Value = serde_json::from_str(&stdout).expect("JSON");
+    assert_eq!((code, info["kind"].as_str(), info["learning_positions"].as_u64()), (0, Some("map"), Some(24)));
+    let (code, stdout, _) = run(omniloc().arg("check").arg(&map));
+    assert!(code == 0 && stdout.contains("sound"), "{stdout}");
+
+    // Learned by heart: every frame of its own recording is found again, but for the coarse grid.
+    let results = folder.path().join("results.json");
+    let (code, stdout, stderr) = run(omniloc()
+        .arg("evaluate")
+        .arg(&recording)
+        .arg("--map")
+        .arg(&map)
+        .arg("--frames")
+        .arg("--json")
+        .arg(&results));
+    assert_eq!(code, 0, "{stderr}");
+    assert!(stdout.contains("against a map: 24 frames"), "{stdout}");
+    let results: serde_json::Value = serde_json::from_slice(&fs::read(results).expect("written")).expect("JSON");
+    let fused = results["results"].as_array().expect("a list").iter().find(|row| row["features"] == "fused");
+    let fused = fused.expect("a fused row");
+    assert!(fused["median_m"].as_f64().expect("a number") < 10.0, "{fused}");
+    assert_eq!(
+        (fused["frames"].as_array().expect("a list").len(), &fused["nees_mean"]),
+        (24, &serde_json::Value::Null)
+    );
+    assert_eq!(results["program"], env!("CARGO_PKG_VERSION"));
+
+    // The same call, the same bytes.
+    let again = folder.path().join("again.map");
+    omniloc().arg("train").arg(&recording).arg("--out").arg(&again).args(["--grid-step-m", "5"]).assert().success();
+    assert!(fs::read(&map).expect("readable") == fs::read(&again).expect("readable"), "training is repeatable");
+}
+
+#[test]
+fn the_protocol_runs_with_both_recipes_and_a_split_from_a_file() {
+    let folder = folder();
+    let recording = recording(&folder, 24);
+    let split = folder.path().join("split.csv");
+    let set = |index: usize| ["learning", "validation", "learning", "test"][index % 4];
+    let lines: String = (0..24).map(|index| format!("{index},{}\n", set(index))).collect();
+    fs::write(&split, format!("index,set\n{lines}")).expect("writes");
+    let results = folder.path().join("results.json");
+    let (code, stdout, stderr) = run(omniloc()
+        .arg("evaluate")
+        .arg(&recording)
+        .args(["--features", "sp", "--grid-step-m", "5", "--split"])
+        .arg(&split)
+        .arg("--json")
+        .arg(&results));
+    assert_eq!(code, 0, "{stderr}");
+    assert!(stdout.contains("12 learning, 6 validation, 6 test frames"), "{stdout}");
+    let results: serde_json::Value = serde_json::from_slice(&fs::read(results).expect("written")).expect("JSON");
+    let rows = results["results"].as_array().expect("a list");
+    let recipes: Vec<_> = rows.iter().map(|row| row["recipe"].as_str()).collect();
+    assert_eq!(recipes, [Some("paper"), Some("default"), None]);
+    let paper = &rows[0];
+    assert!(paper["kept"].as_u64() <= paper["rank"].as_u64() && paper["bic_all"].is_number(), "{paper}");
+    assert!(paper["seed"].is_null() && paper["n_learned_from"] == 12, "{paper}");
+    assert!(rows[1]["n_learned_from"] == 18, "the default recipe refits: {}", rows[1]);
+}
+
+#[test]
+fn what_cannot_be_trained_is_refused_and_leaves_nothing() {
+    let row = |index: usize, place: &str| format!("{index},{index:04}.jpg,{place},,");
+    let one_place: Vec<String> = (0..5).map(|index| row(index, "3,4")).collect();
+    let far: Vec<String> = (0..5).map(|index| row(index, &format!("{},0", index * 1_000_000))).collect();
+    let table: [(&str, Vec<String>, &[&str], i32, &str); 4] = [
+        ("one place", one_place, &[], 1, "learning images are at one place"),
+        ("too few", vec![row(0, "0,0"), row(1, "1,0")], &[], 1, "record more frames"),
+        ("huge area", far, &[], 2, "use a larger --grid-step-m"),
+        (
+            "no grid",
+            vec![row(0, "0,0"), row(1, "1,0"), row(2, "2,0"), row(3, "3,0")],
+            &["--grid-step-m", "0"],
+            2,
+            "grid step 0 m",
+        ),
+    ];
+    for (case, rows, arguments, expected_code, expected) in table {
+        let dataset = TinyDataset::new();
+        dataset.write_rows(&rows.iter().map(String::as_str).collect::<Vec<_>>());
+        let recording = dataset.import("rec.mcap");
+        let map = dataset.path("out.map");
+        let (code, _, stderr) = run(omniloc().arg("train").arg(&recording).arg("--out").arg(&map).args(arguments));
+        assert_eq!(code, expected_code, "{case}: {stderr}");
+        assert!(stderr.contains(expected), "{case}: {stderr}");
+        assert!(!map.exists(), "{case}");
+    }
+}
+
+#[test]
+fn recordings_of_two_lenses_make_no_map() {
+    let (first, second) = (TinyDataset::new(), TinyDataset::new());
+    second.write("donut.json", DONUT.replace("47.5", "46.0").as_bytes());
+    let (a, b) = (first.import("a.mcap"), second.import("b.mcap"));
+    let (code, _, stderr) = run(omniloc().arg("train").args([&a, &b]).arg("--out").arg(first.path("out.map")));
+    assert!(code == 1 && stderr.contains("mixed calibrations") && stderr.contains("b.mcap"), "{stderr}");
+    assert!(!first.path("out.map").exists());
+}
+
+#[test]
+fn images_cut_inside_their_scan_are_named() {
+    let dataset = TinyDataset::new();
+    // A whole-looking frame whose scan lacks its middle.
+    let mut cut = jpeg(96, 96, 2);
+    let length = cut.len();
+    cut.drain(length - 600..length - 2);
+    dataset.write("images/0002.jpg", &cut);
+    let recording = dataset.import("rec.mcap");
+    let (code, _, stderr) = run(omniloc().arg("train").arg(&recording).arg("--out").arg(dataset.path("out.map")));
+    assert!(code == 1 && stderr.contains("frame 2") && stderr.contains("not a whole JPEG"), "{stderr}");
+}
+
+#[test]
+fn damaged_foreign_and_missing_maps_are_refused() {
+    let folder = folder();
+    let recording = recording(&folder, 16);
+    let map = folder.path().join("area.map");
+    let small = ["--features", "gradient-coarse", "--grid-step-m", "10"];
+    omniloc().arg("train").arg(&recording).arg("--out").arg(&map).args(small).assert().success();
+    let bytes = fs::read(&map).expect("readable");
+    let mut flipped = bytes.clone();
+    let middle = flipped.len() / 2;
+    flipped[middle] ^= 1;
+    let newer = String::from_utf8_lossy(&bytes[..2000]).find("format_version").expect("in the header");
+    let mut of_future = bytes.clone();
+    let digit = newer + of_future[newer..].iter().position(u8::is_ascii_digit).expect("a version");
+    of_future[digit] = b'9';
+    for (case, content, expected) in [
+        ("cut", &bytes[..bytes.len() / 2], "damaged"),
+        ("flipped", &flipped, "checksum"),
+        ("newer", &of_future, "version 9, this build reads version 1"),
+        ("text", b"not a map at all", "not a map"),
+        ("empty", b"", "not a map"),
+    ] {
+        let bad = folder.path().join(format!("{case}.map"));
+        fs::write(&bad, content).expect("writes");
+        let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--map").arg(&bad));
+        assert!(code == 1 && stderr.contains(expected) && stderr.contains(case), "{case}: {code} {stderr}");
+        let (code, stdout, _) = run(omniloc().arg("check").arg(&bad));
+        assert!(code == 1 && stdout.contains("NOT SOUND"), "{case}: {stdout}");
+    }
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).args(["--map", "nowhere.map"]));
+    assert!(code == 2 && stderr.contains("nowhere.map"), "{stderr}");
+
+    // Another lens.
+    let tiny = TinyDataset::new();
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(tiny.import("tiny.mcap")).arg("--map").arg(&map));
+    assert!(code == 1 && stderr.contains("the map is of another lens"), "{stderr}");
+}
+
+#[test]
+fn outputs_that_cannot_be_written_are_refused_before_the_work() {
+    let folder = folder();
+    let recording = recording(&folder, 16);
+    let occupied = folder.path().join("there.map");
+    fs::write(&occupied, b"something").expect("writes");
+    let (code, _, stderr) = run(omniloc().arg("train").arg(&recording).arg("--out").arg(&occupied));
+    assert!(code == 2 && stderr.contains("--force"), "{stderr}");
+    assert_eq!(fs::read(&occupied).expect("readable"), b"something");
+    let nowhere = folder.path().join("no/such/folder/results.json");
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--json").arg(&nowhere));
+    assert!(code == 2 && stderr.contains("there is no folder"), "{stderr}");
+}
+
+#[test]
+fn a_bad_split_or_truth_names_its_line() {
+    let dataset = TinyDataset::new();
+    let recording = dataset.import("rec.mcap");
+    let split = dataset.path("split.csv");
+    fs::write(&split, "index,set\n0,learning\n1,exam\n").expect("writes");
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--split").arg(&split));
+    assert!(code == 1 && stderr.contains("split.csv") && stderr.contains("line 3"), "{stderr}");
+    let truth = dataset.path("truth.csv");
+    fs::write(&truth, "index,x_m,y_m\n0,1,2\n1,NaN,3\n").expect("writes");
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--truth").arg(&truth));
+    assert!(code == 1 && stderr.contains("truth.csv: line 3: x_m is `NaN`"), "{stderr}");
+}
+
+/// Set by `tests/run`: a Python with the packages of `tests/python/requirements.txt`.
+#[test]
+fn python_reads_the_map_without_our_code() {
+    let Ok(python) = std::env::var("OMNILOC_PYTHON") else {
+        eprintln!("tests/run sets OMNILOC_PYTHON and runs this");
+        return;
+    };
+    let folder = folder();
+    let recording = recording(&folder, 16);
+    let map = folder.path().join("area.map");
+    omniloc().arg("train").arg(&recording).arg("--out").arg(&map).args(["--grid-step-m", "10"]).assert().success();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/read_map.py");
+    let outcome = std::process::Command::new(python).arg(script).arg(&map).output().expect("OMNILOC_PYTHON runs");
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+}
