@@ -112,7 +112,8 @@ fn what_cannot_be_trained_is_refused_and_leaves_nothing() {
     let row = |index: usize, place: &str| format!("{index},{index:04}.jpg,{place},,");
     let one_place: Vec<String> = (0..5).map(|index| row(index, "3,4")).collect();
     let far: Vec<String> = (0..5).map(|index| row(index, &format!("{},0", index * 1_000_000))).collect();
-    let table: [(&str, Vec<String>, &[&str], i32, &str); 4] = [
+    type Case<'a> = (&'a str, Vec<String>, &'a [&'a str], i32, &'a str);
+    let table: [Case; 4] = [
         ("one place", one_place, &[], 1, "learning images are at one place"),
         ("too few", vec![row(0, "0,0"), row(1, "1,0")], &[], 1, "record more frames"),
         ("huge area", far, &[], 2, "use a larger --grid-step-m"),

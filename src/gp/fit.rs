@@ -368,11 +368,11 @@ mod tests {
             };
             let (_, gradient) =
                 likelihood_and_gradient(&learning, &z, &Hyperparameters::from_log(log)).expect("positive definite");
-            for i in 0..4 {
+            for (i, &slope) in gradient.iter().enumerate() {
                 let shifted = |by: f64| std::array::from_fn(|k| log[k] + if k == i { by } else { 0.0 });
                 let difference = (at(shifted(STEP)) - at(shifted(-STEP))) / (2.0 * STEP);
-                let scale = gradient[i].abs().max(1.0);
-                assert!((gradient[i] - difference).abs() < 1e-5 * scale, "{log:?} {i}: {} {difference}", gradient[i]);
+                let scale = slope.abs().max(1.0);
+                assert!((slope - difference).abs() < 1e-5 * scale, "{log:?} {i}: {slope} {difference}");
             }
         }
     }
