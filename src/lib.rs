@@ -1,4 +1,39 @@
 //! omniloc tells a vehicle where it is from one omnidirectional camera.
+//!
+//! A camera looks into a donut-shaped panoramic lens and sees the whole horizon in one image. On a survey drive these
+//! images are recorded together with positions; the recording becomes a *map*, in which every property of the image is a
+//! Gaussian process over the plane; and a later image is where in the map it most likely was taken. The method is that of
+//! Do, Jadaliha, Choi and Lim, “Feature selection for position estimation using an omnidirectional camera”, Image and
+//! Vision Computing 39 (2015) 1–9, cited as Do et al. (2015).
+//!
+//! Data flows one way, and the folders are the stages:
+//!
+//! ```text
+//! images and positions ─► recording ─► panorama ─► features ─┬─► train ─► map      one Gaussian process a feature
+//!                                                            └─► localize          against the map ─► position
+//! ```
+//!
+//! | module | what it is for |
+//! |---|---|
+//! | [`types`] | words every folder may use: positions, calibration, images |
+//! | [`recording`] | MCAP on disk; import and export of image folders |
+//! | [`jpeg`] | JPEG in, luma out |
+//! | [`calibrate`] | finds the donut in the image |
+//! | [`panorama`] | unwraps the donut |
+//! | [`features`] | panorama → descriptor → features |
+//! | [`gp`] | Gaussian-process regression: pure mathematics |
+//! | [`map`] | what localizing needs to know of a place, and its file |
+//! | [`localize`] | features of one frame against the map |
+//! | [`train`] | recordings → map: recipes, splits, selection |
+//! | [`evaluate`] | error figures and the paper's tables |
+//! | [`commands`] | the program: one file a command |
+//!
+//! # Frames and units
+//!
+//! The map frame is ENU: x east, y north, in metres from the recording's origin. Yaw is counted from east,
+//! counter-clockwise, in radians. Pixel centres are at integer coordinates, x to the right, y down. Names end with their
+//! unit: `_m _rad _deg _px _ns`. `f32` for pixels, descriptors and fields on cells, `f64` for geometry and Gaussian
+//! processes.
 
 pub mod calibrate;
 pub mod commands;

@@ -81,6 +81,8 @@ pub struct GradientSignature {
     north: Vec<f32>,
     local_mean: Vec<f32>,
     bins: Vec<f32>,
+    /// The first harmonics of every row of `bins`: bin × band × harmonic.
+    harmonics: Vec<Complex<f32>>,
     spectrum: Vec<Complex<f32>>,
     fft_scratch: Vec<Complex<f32>>,
 }
@@ -108,23 +110,43 @@ impl GradientSignature {
             north: plane(),
             local_mean: plane(),
             bins: vec![0.0; BINS * sizes.bands * columns],
+            harmonics: vec![Complex::default(); BINS * sizes.bands * HARMONICS],
             spectrum: transform.make_output_vec(),
             fft_scratch: transform.make_scratch_vec(),
             transform,
         }
     }
 
-    pub fn describe(&mut self, panorama: &Panorama, sign: Sign, properties: &mut [f32]) {
+    /// Takes the orientations of `panorama` in, for [`describe`](Self::describe).
+    pub fn look(&mut self, panorama: &Panorama) {
         self.reduce_to_log(panorama);
         blur(&mut self.plane, &mut self.scratch, self.columns, &self.blur);
         self.differentiate();
         blur(&mut self.local_mean, &mut self.scratch, self.columns, &self.contrast);
         self.gather_orientations();
-        if sign == Sign::Unsigned {
-            let (first, opposite) = self.bins.split_at_mut(BINS / 2 * self.sizes.bands * self.columns);
-            first.iter_mut().zip(&*opposite).for_each(|(sum, opposite)| *sum += opposite);
+        self.transform_bands();
+    }
+
+    /// The signature of the panorama last looked at.
+    pub fn describe(&self, sign: Sign, properties: &mut [f32]) {
+        let scale = 1.0 / self.columns as f32;
+        let magnitude = |harmonic: Complex<f32>| (scale * harmonic.norm()).sqrt();
+        match sign {
+            Sign::Signed => {
+                for (property, &harmonic) in properties.iter_mut().zip(&self.harmonics) {
+                    *property = magnitude(harmonic);
+                }
+            }
+            Sign::Unsigned => {
+                // The transform is linear: that of the sum of two bins is the sum of theirs.
+                let (first, opposite) = self.harmonics.split_at(self.harmonics.len() / 2);
+                for (property, (harmonic, opposite)) in properties.iter_mut().zip(first.iter().zip(opposite)) {
+                    *property = magnitude(harmonic + opposite);
+                }
+            }
         }
-        self.transform_bands(properties);
+        let norm = properties.iter().map(|y| y * y).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+        properties.iter_mut().for_each(|y| *y /= norm);
     }
 
     /// plane = log of the reduced panorama.
@@ -187,18 +209,14 @@ impl GradientSignature {
         self.bins.iter_mut().for_each(|sum| *sum *= mean);
     }
 
-    fn transform_bands(&mut self, properties: &mut [f32]) {
-        let columns = self.columns;
-        for (row, magnitudes) in self.bins.chunks_exact_mut(columns).zip(properties.chunks_exact_mut(HARMONICS)) {
+    fn transform_bands(&mut self) {
+        let rows = self.bins.chunks_exact_mut(self.columns);
+        for (row, harmonics) in rows.zip(self.harmonics.chunks_exact_mut(HARMONICS)) {
             self.transform
                 .process_with_scratch(row, &mut self.spectrum, &mut self.fft_scratch)
                 .expect("the buffers come from the plan");
-            for (magnitude, harmonic) in magnitudes.iter_mut().zip(&self.spectrum) {
-                *magnitude = (harmonic.norm() / columns as f32).sqrt();
-            }
+            harmonics.copy_from_slice(&self.spectrum[..HARMONICS]);
         }
-        let norm = properties.iter().map(|y| y * y).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
-        properties.iter_mut().for_each(|y| *y /= norm);
     }
 }
 
@@ -282,12 +300,35 @@ mod tests {
 
     fn describe((sizes, sign): (Sizes, Sign), panorama: &Panorama) -> Vec<f32> {
         let mut properties = vec![0.0; sizes.dimensions(sign)];
-        GradientSignature::new(sizes).describe(panorama, sign, &mut properties);
+        let mut signature = GradientSignature::new(sizes);
+        signature.look(panorama);
+        signature.describe(sign, &mut properties);
         properties
     }
 
     fn distance(a: &[f32], b: &[f32]) -> f32 {
         a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt()
+    }
+
+    #[test]
+    fn unsigned_is_the_signature_of_opposite_bins_added() {
+        let mut signature = GradientSignature::new(COARSE);
+        signature.look(&textured());
+        let mut unsigned = vec![0.0; COARSE.dimensions(Sign::Unsigned)];
+        signature.describe(Sign::Unsigned, &mut unsigned);
+        // The other route: add the histograms, then transform.
+        signature.differentiate();
+        blur(&mut signature.local_mean, &mut signature.scratch, signature.columns, &signature.contrast);
+        signature.gather_orientations();
+        let (first, opposite) = signature.bins.split_at_mut(BINS / 2 * COARSE.bands * signature.columns);
+        first.iter_mut().zip(&*opposite).for_each(|(sum, opposite)| *sum += opposite);
+        signature.transform_bands();
+        let scale = 1.0 / signature.columns as f32;
+        let mut direct: Vec<f32> =
+            signature.harmonics[..unsigned.len()].iter().map(|harmonic| (scale * harmonic.norm()).sqrt()).collect();
+        let norm = direct.iter().map(|y| y * y).sum::<f32>().sqrt();
+        direct.iter_mut().for_each(|y| *y /= norm);
+        assert!(distance(&unsigned, &direct) < 1e-5, "{}", distance(&unsigned, &direct));
     }
 
     #[test]

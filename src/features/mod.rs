@@ -144,22 +144,36 @@ impl Describer {
         }
     }
 
-    /// Fills `properties` with the `descriptor` of `panorama`.
+    /// The `descriptors` of `panorama`, each into its own of `properties`. What several of them need is computed once.
     ///
     /// # Panics
-    /// When `properties` is not [`Descriptor::dimensions`] long.
-    pub fn describe(&mut self, descriptor: Descriptor, panorama: &Panorama, properties: &mut [f32]) {
-        assert_eq!(properties.len(), descriptor.dimensions(), "room for the properties of {descriptor}");
-        match descriptor {
-            Descriptor::Fft => self.fft.describe(panorama, properties),
-            Descriptor::Hist => histogram::describe(panorama, properties),
-            Descriptor::HistSqrt => histogram::describe_sqrt(panorama, properties),
-            Descriptor::Sp => self.pyramid.describe(panorama, Response::Magnitude, properties),
-            Descriptor::SpLog => self.pyramid.describe(panorama, Response::LogMagnitude, properties),
-            Descriptor::SpEnergy => self.pyramid.describe(panorama, Response::Energy, properties),
-            Descriptor::Gradient => self.gradient.describe(panorama, Sign::Signed, properties),
-            Descriptor::GradientUnsigned => self.gradient.describe(panorama, Sign::Unsigned, properties),
-            Descriptor::GradientCoarse => self.gradient_coarse.describe(panorama, Sign::Signed, properties),
+    /// When one of `properties` is not [`Descriptor::dimensions`] long.
+    pub fn describe(&mut self, descriptors: &[Descriptor], panorama: &Panorama, properties: &mut [Vec<f32>]) {
+        let wanted = |of: &[Descriptor]| descriptors.iter().any(|descriptor| of.contains(descriptor));
+        if wanted(&[Descriptor::Gradient, Descriptor::GradientUnsigned]) {
+            self.gradient.look(panorama);
         }
+        if wanted(&[Descriptor::GradientCoarse]) {
+            self.gradient_coarse.look(panorama);
+        }
+        for (&descriptor, properties) in descriptors.iter().zip(properties) {
+            assert_eq!(properties.len(), descriptor.dimensions(), "room for the properties of {descriptor}");
+            match descriptor {
+                Descriptor::Fft => self.fft.describe(panorama, properties),
+                Descriptor::Hist => histogram::describe(panorama, properties),
+                Descriptor::HistSqrt => histogram::describe_sqrt(panorama, properties),
+                Descriptor::Sp => self.pyramid.describe(panorama, Response::Magnitude, properties),
+                Descriptor::SpLog => self.pyramid.describe(panorama, Response::LogMagnitude, properties),
+                Descriptor::SpEnergy => self.pyramid.describe(panorama, Response::Energy, properties),
+                Descriptor::Gradient => self.gradient.describe(Sign::Signed, properties),
+                Descriptor::GradientUnsigned => self.gradient.describe(Sign::Unsigned, properties),
+                Descriptor::GradientCoarse => self.gradient_coarse.describe(Sign::Signed, properties),
+            }
+        }
+    }
+
+    /// Vectors of the right lengths for [`describe`](Self::describe).
+    pub fn room_for(descriptors: &[Descriptor]) -> Vec<Vec<f32>> {
+        descriptors.iter().map(|descriptor| vec![0.0; descriptor.dimensions()]).collect()
     }
 }

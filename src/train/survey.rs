@@ -241,24 +241,18 @@ fn describe_frame(
     options: &SurveyOptions,
     stream: u64,
 ) -> Vec<(Vec<f32>, Vec<f32>)> {
-    let describe = |describer: &mut Describer, descriptor: Descriptor, panorama: &Panorama| {
-        let mut properties = vec![0.0; descriptor.dimensions()];
-        describer.describe(descriptor, panorama, &mut properties);
-        properties
-    };
-    let mut described: Vec<(Vec<f32>, Vec<f32>)> =
-        options.descriptors.iter().map(|&descriptor| (describe(describer, descriptor, panorama), Vec::new())).collect();
-    if options.perturbed.is_empty() {
-        return described;
-    }
-    for repetition in 0..options.repetitions as u64 {
+    let mut clean = Describer::room_for(&options.descriptors);
+    describer.describe(&options.descriptors, panorama, &mut clean);
+    let mut changes = vec![Vec::new(); options.descriptors.len()];
+    let mut there = Describer::room_for(&options.perturbed);
+    for repetition in 0..if options.perturbed.is_empty() { 0 } else { options.repetitions as u64 } {
         let other_day = perturbed(panorama, options.seed, stream * options.repetitions as u64 + repetition);
-        for (descriptor, (clean, changes)) in options.descriptors.iter().zip(&mut described) {
-            if options.perturbed.contains(descriptor) {
-                let properties = describe(describer, *descriptor, &other_day);
-                changes.extend(properties.iter().zip(&*clean).map(|(there, here)| there - here));
-            }
+        describer.describe(&options.perturbed, &other_day, &mut there);
+        for (descriptor, there) in options.perturbed.iter().zip(&there) {
+            let at = options.descriptors.iter().position(|other| other == descriptor);
+            let at = at.expect("what is perturbed is also described");
+            changes[at].extend(there.iter().zip(&clean[at]).map(|(there, here)| there - here));
         }
     }
-    described
+    clean.into_iter().zip(changes).collect()
 }
