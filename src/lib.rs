@@ -25,7 +25,8 @@
 //! | [`map`] | what localizing needs to know of a place, and its file |
 //! | [`localize`] | features of one frame against the map |
 //! | [`train`] | recordings → map: recipes, splits, selection |
-//! | [`evaluate`] | error figures and the paper's tables |
+//! | [`metrics`] | error figures of position estimates |
+//! | [`evaluate`] | the protocol's results and the paper's tables |
 //! | [`commands`] | the program: one file a command |
 //!
 //! # Frames and units
@@ -45,6 +46,7 @@ pub mod gp;
 pub mod jpeg;
 pub mod localize;
 pub mod map;
+pub mod metrics;
 pub mod panorama;
 pub mod recording;
 pub mod train;

@@ -13,13 +13,12 @@ use super::survey::{
     bad_argument, default_grid_step_m, open_recordings, parse_descriptor, read_to_learn, read_to_match, read_truth,
 };
 use super::{BadArgument, DONE, print};
-use crate::evaluate::{Entry, ErrorFigures, LEGEND, against_map, table};
+use crate::evaluate::{Entry, LEGEND, against_map, table};
 use crate::features::Descriptor;
-use crate::map::{FeatureMap, file};
+use crate::map::{FeatureMap, Recipe, RecipeName, Selection, SplitKind, file};
+use crate::metrics::{ErrorFigures, component_median};
 use crate::recording::{Recording, RecordingError, write_file_atomically};
-use crate::train::{
-    Outcome, Recipe, RecipeName, Selection, Split, SplitKind, Survey, Trial, component_median, noisy, run as run_trial,
-};
+use crate::train::{Outcome, Split, Survey, Trial, noisy, run as run_trial};
 use crate::types::PositionM;
 
 /// Measure how well the method localizes on recordings

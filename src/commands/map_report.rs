@@ -6,8 +6,7 @@ use std::path::Path;
 use serde_json::json;
 
 use crate::gp::fit::Warning;
-use crate::map::{FeatureMap, GroupInfo};
-use crate::train::GroupHyperparameters;
+use crate::map::{FeatureMap, GroupHyperparameters, GroupInfo};
 
 /// Fits of a group by what they have to say.
 pub fn warnings(group: &GroupInfo) -> BTreeMap<Warning, usize> {

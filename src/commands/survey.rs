@@ -8,8 +8,9 @@ use super::BadArgument;
 use super::options::check_input;
 use super::progress::Progress;
 use crate::features::Descriptor;
+use crate::map::{PERTURBED_COPIES, Recipe};
 use crate::recording::Recording;
-use crate::train::{PERTURBED_COPIES, Recipe, Survey, SurveyOptions, TrialError};
+use crate::train::{Survey, SurveyOptions, TrialError};
 use crate::types::PositionM;
 
 /// Opens `paths`, all of which must be usable.

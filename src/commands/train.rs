@@ -10,9 +10,9 @@ use super::progress::Progress;
 use super::survey::{bad_argument, default_grid_step_m, open_recordings, parse_descriptor, read_to_learn};
 use super::{DONE, print};
 use crate::features::Descriptor;
-use crate::map::file;
+use crate::map::{Recipe, RecipeName, Selection, SplitKind, file};
 use crate::recording::{RecordingError, write_file_atomically};
-use crate::train::{Recipe, RecipeName, Selection, SplitKind, TrainSettings, train};
+use crate::train::{TrainSettings, train};
 
 /// Turn recordings of a place into a map
 ///

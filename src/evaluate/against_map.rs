@@ -19,7 +19,7 @@ pub struct MapOutcome {
 
 /// Estimates for every frame of `survey`: one outcome a group, and one of all groups fused if there are several.
 pub fn against_map(survey: &Survey, map: &FeatureMap) -> Vec<MapOutcome> {
-    let fields: Vec<FieldOnCells> = map.groups.iter().map(|group| group.field()).collect();
+    let fields: Vec<FieldOnCells> = map.groups.iter().map(FieldOnCells::of).collect();
     let rows: Vec<usize> = (0..survey.len()).collect();
     let features: Vec<_> = map
         .info

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::ErrorFigures;
+use crate::metrics::ErrorFigures;
 use crate::types::PositionM;
 
 /// One row of the evaluation. The names are a contract with scripts: keys are added, never renamed; `null` where a

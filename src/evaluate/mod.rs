@@ -2,8 +2,6 @@
 
 mod against_map;
 mod entry;
-mod metrics;
 
 pub use against_map::{MapOutcome, against_map};
 pub use entry::{Entry, FrameEntry, LEGEND, table};
-pub use metrics::ErrorFigures;

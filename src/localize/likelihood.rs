@@ -3,19 +3,8 @@
 use std::f64::consts::TAU;
 
 use multiversion::multiversion;
-use serde::{Deserialize, Serialize};
 
-/// How the residuals of a group of features add up to a log-likelihood. With r_i = (z_i − μ_i)² / p_i, where
-/// p_i = σ_e² + v_i is the predictive variance:
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum NoiseModel {
-    /// −½ Σ (r_i + log p_i + log 2π): Do et al. (2015), eqs. 10 and 11.
-    Gaussian,
-    /// −k/2 log Σ r_i − ½ Σ log p_i: one unknown factor on all the variances of a frame, at its most likely value. Light
-    /// and traffic change a frame's residuals together; a frame that fits nowhere well is not trusted k times over.
-    UnknownScale,
-}
+use crate::map::{MapGroup, NoiseModel};
 
 /// A group's Gaussian processes on the candidate cells.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,6 +42,13 @@ impl FieldOnCells {
             precision: variance.iter().map(|p| 1.0 / p).collect(),
             log_normalizer: log_normalizer.into_iter().map(|value| value as f32).collect(),
         }
+    }
+
+    /// Those of a map.
+    pub fn of(group: &MapGroup) -> Self {
+        let features = group.scaling.features();
+        let cells = group.field_mean.len() / features.max(1);
+        Self::new(features, cells, group.field_mean.clone(), &group.field_variance)
     }
 
     pub fn features(&self) -> usize {

@@ -4,4 +4,4 @@ mod estimate;
 mod likelihood;
 
 pub use estimate::{most_likely_cell, refined_m};
-pub use likelihood::{FieldOnCells, NoiseModel};
+pub use likelihood::FieldOnCells;

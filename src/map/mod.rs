@@ -6,16 +6,19 @@
 
 mod cells;
 pub mod file;
+mod recipe;
 
 use faer::Mat;
 use serde::{Deserialize, Serialize};
 
 pub use cells::{CandidateCells, CellsError, Grid};
 pub use file::{FORMAT_VERSION, MapError};
+pub use recipe::{
+    GroupHyperparameters, GroupRecipe, Model, NoiseModel, NoiseWhiteningSettings, PERTURBED_COPIES, Recipe, RecipeName,
+    Selection, SplitKind,
+};
 
 use crate::features::scaling::Scaling;
-use crate::localize::FieldOnCells;
-use crate::train::{GroupHyperparameters, GroupRecipe, RecipeName, Selection, SplitKind};
 use crate::types::{DonutCalibration, Geodetic, PositionM};
 
 #[derive(Debug, Clone)]
@@ -129,20 +132,11 @@ impl MapInfo {
     }
 }
 
-impl MapGroup {
-    /// The posterior, ready to match frames against.
-    pub fn field(&self) -> FieldOnCells {
-        let cells = self.field_mean.len() / self.scaling.features().max(1);
-        FieldOnCells::new(self.scaling.features(), cells, self.field_mean.clone(), &self.field_variance)
-    }
-}
-
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
     use crate::features::Descriptor;
     use crate::gp::Hyperparameters;
-    use crate::train::Recipe;
     use crate::types::{AzimuthSense, LensKind};
 
     /// Three positions, two features of `sp`.

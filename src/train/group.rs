@@ -4,14 +4,13 @@ use std::collections::BTreeMap;
 
 use faer::{Mat, MatRef};
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use super::noise_whitening;
-use super::recipe::{GroupRecipe, Model};
 use crate::features::scaling::{Scaling, ScalingError};
-use crate::gp::fit::{Fit, Warning, fit_each};
+use crate::gp::fit::{Warning, fit_each};
 use crate::gp::{GpError, Hyperparameters, LearningPositions, Posterior};
 use crate::localize::FieldOnCells;
+use crate::map::{GroupHyperparameters, GroupRecipe, Model};
 use crate::types::PositionM;
 
 /// What was learned of one descriptor's k features.
@@ -24,15 +23,6 @@ pub struct LearnedGroup {
     pub learning: Mat<f64>,
     /// Number of features before any was left out.
     pub rank: usize,
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum GroupHyperparameters {
-    /// One fit a feature.
-    Each(Vec<Fit>),
-    /// The same for all features.
-    Shared(Hyperparameters),
 }
 
 #[derive(Debug, thiserror::Error)]

@@ -6,25 +6,24 @@
 mod group;
 pub mod noise_whitening;
 pub mod perturbation;
-mod recipe;
 mod split;
 mod subset;
 mod survey;
 mod trial;
 
-pub use group::{GroupHyperparameters, LearnError, LearnedGroup};
-pub use recipe::{GroupRecipe, Model, PERTURBED_COPIES, Recipe, RecipeName, Selection};
-pub use split::{Split, SplitError, SplitKind};
-pub use subset::{Elimination, LikelihoodTable, backward_elimination, component_median};
+pub use group::{LearnError, LearnedGroup};
+pub use split::{Split, SplitError};
+pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
 pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
 
-use crate::evaluate::ErrorFigures;
 use crate::gp::LearningPositions;
 use crate::gp::fit::median_neighbour_spacing_m;
 use crate::map::{
-    CandidateCells, FORMAT_VERSION, FeatureMap, GroupInfo, MapGroup, MapInfo, TrainedOn, ValidationFigures,
+    CandidateCells, FORMAT_VERSION, FeatureMap, GroupInfo, MapGroup, MapInfo, Recipe, Selection, SplitKind, TrainedOn,
+    ValidationFigures,
 };
+use crate::metrics::ErrorFigures;
 
 /// Choices of a training run.
 #[derive(Debug, Clone, Copy, PartialEq)]

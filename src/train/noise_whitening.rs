@@ -8,22 +8,10 @@
 use faer::linalg::solvers::Svd;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{Mat, MatRef, Par, Side};
-use serde::{Deserialize, Serialize};
 
 use crate::features::scaling::{Scaling, ScalingError};
 use crate::gp::{Hyperparameters, LearningPositions, fit::median_neighbour_spacing_m};
-
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Settings {
-    /// At most this many features.
-    pub features: usize,
-    /// Length scale as a multiple of the median distance to the nearest learning position.
-    pub length_scale_spacings: f64,
-    /// Added to the noise covariance, as a share of its mean eigenvalue: directions never seen to vary are not thereby
-    /// free of noise.
-    pub ridge: f64,
-}
+use crate::map::NoiseWhiteningSettings;
 
 /// What is learned: the scaling, and one set of hyperparameters for all features.
 #[derive(Debug, Clone)]
@@ -50,7 +38,7 @@ const LOG2_NOISE_RATIOS: std::ops::RangeInclusive<i32> = -20..=5;
 /// # Errors
 /// As [`Scaling::learn`].
 pub fn learn(
-    settings: &Settings,
+    settings: &NoiseWhiteningSettings,
     learning: &LearningPositions,
     properties: MatRef<f64>,
     changes: MatRef<f64>,
@@ -168,7 +156,8 @@ mod tests {
         (learning, properties, changes)
     }
 
-    const SETTINGS: Settings = Settings { features: 96, length_scale_spacings: 2.0, ridge: 0.05 };
+    const SETTINGS: NoiseWhiteningSettings =
+        NoiseWhiteningSettings { features: 96, length_scale_spacings: 2.0, ridge: 0.05 };
 
     #[test]
     fn the_first_feature_tells_places_apart_and_days_do_not_move_it() {

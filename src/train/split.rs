@@ -3,10 +3,10 @@
 use std::collections::HashMap;
 use std::io::Read;
 
+use crate::map::SplitKind;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 
 /// Positions in the list of frames, each set in rising order.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -17,16 +17,6 @@ pub struct Split {
     pub validation: Vec<usize>,
     /// Only measured on.
     pub test: Vec<usize>,
-}
-
-/// How frames are split.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum SplitKind {
-    /// Every frame on its own, at random: the paper's. Test frames lie between their own neighbours.
-    Random,
-    /// Contiguous stretches of the drive, at random: the nearest learning frames may be far.
-    Blocked,
 }
 
 #[derive(Debug, thiserror::Error)]

@@ -2,6 +2,7 @@
 
 use rayon::prelude::*;
 
+use crate::metrics::component_median;
 use crate::types::{PositionM, distance_m};
 
 /// Log-likelihoods of validation images: for every query, feature and candidate cell.
@@ -131,20 +132,6 @@ fn median_rmse_m(table: &LikelihoodTable) -> f64 {
     let center = component_median(&truths);
     let sum: f64 = truths.iter().map(|&truth| distance_m(truth, center).powi(2)).sum();
     (sum / truths.len() as f64).sqrt()
-}
-
-/// Component-wise median; the mean of the two middle values where their number is even.
-pub fn component_median(positions: &[PositionM]) -> PositionM {
-    [0, 1].map(|axis| {
-        let mut values: Vec<f64> = positions.iter().map(|p| p[axis]).collect();
-        values.sort_by(f64::total_cmp);
-        let middle = values.len() / 2;
-        match values.len() {
-            0 => 0.0,
-            n if n % 2 == 1 => values[middle],
-            _ => 0.5 * (values[middle - 1] + values[middle]),
-        }
-    })
 }
 
 /// Σ_r L_r over the kept features, for one query.
@@ -298,11 +285,5 @@ mod tests {
                 kept.retain(|&r| r != removed);
             }
         }
-    }
-
-    #[test]
-    fn median_is_component_wise() {
-        assert_eq!(component_median(&[[0.0, 5.0], [1.0, 1.0], [9.0, 2.0]]), [1.0, 2.0]);
-        assert_eq!(component_median(&[[0.0, 5.0], [1.0, 1.0]]), [0.5, 3.0]);
     }
 }

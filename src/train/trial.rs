@@ -5,13 +5,13 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use super::group::{LearnError, LearnedGroup};
-use super::recipe::{Recipe, Selection};
 use super::split::Split;
-use super::subset::{LikelihoodTable, backward_elimination, component_median};
+use super::subset::{LikelihoodTable, backward_elimination};
 use super::survey::Survey;
 use crate::gp::{GpError, LearningPositions};
-use crate::localize::{FieldOnCells, NoiseModel, most_likely_cell, refined_m};
-use crate::map::{CandidateCells, CellsError};
+use crate::localize::{FieldOnCells, most_likely_cell, refined_m};
+use crate::map::{CandidateCells, CellsError, NoiseModel, Recipe, Selection};
+use crate::metrics::component_median;
 use crate::types::PositionM;
 
 /// One way of carrying out the protocol.

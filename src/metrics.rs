@@ -2,7 +2,6 @@
 
 use serde::Serialize;
 
-use crate::train::component_median;
 use crate::types::{PositionM, distance_m};
 
 /// Figures of the position errors \[m\] of n estimates.
@@ -45,6 +44,20 @@ impl ErrorFigures {
     }
 }
 
+/// Component-wise median; the mean of the two middle values where their number is even.
+pub fn component_median(positions: &[PositionM]) -> PositionM {
+    [0, 1].map(|axis| {
+        let mut values: Vec<f64> = positions.iter().map(|p| p[axis]).collect();
+        values.sort_by(f64::total_cmp);
+        let middle = values.len() / 2;
+        match values.len() {
+            0 => 0.0,
+            n if n % 2 == 1 => values[middle],
+            _ => 0.5 * (values[middle - 1] + values[middle]),
+        }
+    })
+}
+
 fn root_mean_square(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
 }
@@ -81,5 +94,11 @@ mod tests {
         let truth_m = [[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]];
         let figures = ErrorFigures::of(&[[0.0, 0.0]; 3], &truth_m).expect("there are estimates");
         assert!(figures.skill.abs() < 1e-12);
+    }
+
+    #[test]
+    fn median_is_component_wise() {
+        assert_eq!(component_median(&[[0.0, 5.0], [1.0, 1.0], [9.0, 2.0]]), [1.0, 2.0]);
+        assert_eq!(component_median(&[[0.0, 5.0], [1.0, 1.0]]), [0.5, 3.0]);
     }
 }

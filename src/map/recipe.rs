@@ -2,11 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::noise_whitening;
 use crate::features::Descriptor;
 use crate::features::scaling::ScalingMethod;
-use crate::gp::fit::Bounds;
-use crate::localize::NoiseModel;
+use crate::gp::Hyperparameters;
+use crate::gp::fit::{Bounds, Fit};
 
 /// The recipes the program knows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -48,6 +47,18 @@ pub struct Recipe {
     pub refit: bool,
 }
 
+/// How the residuals of a group of features add up to a log-likelihood. With r_i = (z_i − μ_i)² / p_i, where
+/// p_i = σ_e² + v_i is the predictive variance:
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NoiseModel {
+    /// −½ Σ (r_i + log p_i + log 2π): Do et al. (2015), eqs. 10 and 11.
+    Gaussian,
+    /// −k/2 log Σ r_i − ½ Σ log p_i: one unknown factor on all the variances of a frame, at its most likely value. Light
+    /// and traffic change a frame's residuals together; a frame that fits nowhere well is not trusted k times over.
+    UnknownScale,
+}
+
 /// One descriptor's part of a recipe.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GroupRecipe {
@@ -65,7 +76,20 @@ pub enum Model {
     /// Scaled by `scaling`; every feature with hyperparameters of its own, within `bounds`.
     EachFeature { scaling: ScalingMethod, bounds: Bounds },
     /// Noise-whitened features that share their hyperparameters.
-    SharedField(noise_whitening::Settings),
+    SharedField(NoiseWhiteningSettings),
+}
+
+/// How noise-whitened features are learned.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoiseWhiteningSettings {
+    /// At most this many features.
+    pub features: usize,
+    /// Length scale as a multiple of the median distance to the nearest learning position.
+    pub length_scale_spacings: f64,
+    /// Added to the noise covariance, as a share of its mean eigenvalue: directions never seen to vary are not thereby
+    /// free of noise.
+    pub ridge: f64,
 }
 
 impl Recipe {
@@ -91,7 +115,7 @@ impl Recipe {
 
     fn default_over(descriptors: &[Descriptor]) -> Self {
         let model =
-            Model::SharedField(noise_whitening::Settings { features: 96, length_scale_spacings: 1.75, ridge: 0.05 });
+            Model::SharedField(NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.75, ridge: 0.05 });
         let group = |&descriptor| GroupRecipe { descriptor, model, noise: NoiseModel::UnknownScale, weight: 1.0 };
         Self {
             name: RecipeName::Default,
@@ -122,3 +146,23 @@ impl Recipe {
 const DEFAULT: [Descriptor; 3] = [Descriptor::Gradient, Descriptor::GradientUnsigned, Descriptor::GradientCoarse];
 /// Perturbed copies of every learning image.
 pub const PERTURBED_COPIES: usize = 2;
+
+/// How frames are split.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum SplitKind {
+    /// Every frame on its own, at random: the paper's. Test frames lie between their own neighbours.
+    Random,
+    /// Contiguous stretches of the drive, at random: the nearest learning frames may be far.
+    Blocked,
+}
+
+/// Hyperparameters of a group's Gaussian processes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum GroupHyperparameters {
+    /// One fit a feature.
+    Each(Vec<Fit>),
+    /// The same for all features.
+    Shared(Hyperparameters),
+}
