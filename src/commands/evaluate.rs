@@ -283,7 +283,7 @@ fn trial_entries(
 fn estimates_of<'a>(recipe: &Recipe, outcome: &'a Outcome) -> &'a [PositionM] {
     match recipe.selection {
         Selection::None => &outcome.all_test_m,
-        Selection::Backward => &outcome.kept_test_m,
+        Selection::Backward | Selection::Folded => &outcome.kept_test_m,
     }
 }
 

@@ -59,6 +59,17 @@ impl FieldOnCells {
         self.cells
     }
 
+    /// The same field, of the features `kept` only.
+    pub fn select(&self, kept: &[usize]) -> Self {
+        let mean = kept.iter().flat_map(|&feature| self.mean_of(feature)).copied().collect();
+        let variance: Vec<f32> = if self.precision.len() == self.cells {
+            self.precision.iter().map(|precision| 1.0 / precision).collect()
+        } else {
+            kept.iter().flat_map(|&feature| self.precision_of(feature)).map(|precision| 1.0 / precision).collect()
+        };
+        Self::new(kept.len(), self.cells, mean, &variance)
+    }
+
     fn precision_of(&self, feature: usize) -> &[f32] {
         let row = if self.precision.len() == self.cells { 0 } else { feature };
         &self.precision[row * self.cells..(row + 1) * self.cells]

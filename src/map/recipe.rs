@@ -32,8 +32,10 @@ impl RecipeName {
 pub enum Selection {
     /// All are kept.
     None,
-    /// Backward sequential elimination.
+    /// Backward sequential elimination: the paper's.
     Backward,
+    /// The most predictable ones, as many as score best on folds of the learning images.
+    Folded,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -3,6 +3,7 @@
 //! A [`Survey`] holds positions and properties of all frames; a [`Recipe`] says how they become features and Gaussian
 //! processes; [`run`] carries out the paper's protocol on a [`Split`]; [`train`] makes a map of everything.
 
+mod folded;
 mod group;
 pub mod noise_whitening;
 pub mod perturbation;
@@ -85,7 +86,7 @@ pub fn train(
         let descriptor = selected.recipe.descriptor;
         let properties = survey.properties(descriptor, &everything);
         let group = match recipe.selection {
-            Selection::Backward => selected.conditioned_on(properties.as_ref()),
+            Selection::Backward | Selection::Folded => selected.conditioned_on(properties.as_ref()),
             Selection::None => {
                 on_step(Step::Fitting { descriptor: descriptor.name(), features: descriptor.dimensions() });
                 let changes = survey.changes(descriptor, &everything);

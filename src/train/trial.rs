@@ -4,6 +4,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
+use super::folded::folded_selection;
 use super::group::{LearnError, LearnedGroup};
 use super::split::Split;
 use super::subset::{LikelihoodTable, backward_elimination};
@@ -82,6 +83,8 @@ pub enum TrialError {
 
 /// Fewer learning images than this have no Gaussian process worth the name.
 const MIN_LEARNING: usize = 3;
+/// How learning images fall into folds.
+const FOLD_SEED: u64 = 0;
 /// A likelihood table larger than this is refused.
 const MAX_TABLE_BYTES: usize = 4 << 30;
 
@@ -169,6 +172,7 @@ fn run_once(
         let field = group.on_cells(&learning, &centers_m)?;
         let kept = match trial.recipe.selection {
             Selection::None => (0..group.features()).collect(),
+            Selection::Folded => folded_selection(&group, &learning, &cells, FOLD_SEED)?,
             Selection::Backward => queries.select(&group, &field, &centers_m, on_step)?,
         };
         let kept_group = group.select(&kept);
