@@ -121,11 +121,10 @@ fn eliminate(directory: &Path) -> Result<Value, Box<dyn Error>> {
     let truths = positions(&directory.join("truth.f64"))?;
     let values = floats(&directory.join("table.f32"))?;
     let features = values.len() / cells.len() / truths.len();
-    let rows: Vec<Vec<f32>> = values.chunks_exact(features * cells.len()).map(<[f32]>::to_vec).collect();
-    drop(values);
+    let size = features * cells.len();
     let start = cpu_s();
     let mut table = LikelihoodTable::new(features, cells);
-    for (row, truth_m) in rows.into_iter().zip(truths) {
+    for (row, truth_m) in values.chunks_exact(size).zip(truths) {
         table.push(truth_m, row);
     }
     let path = backward_elimination(&table, |_| {});
