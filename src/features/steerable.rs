@@ -1,6 +1,7 @@
 //! Steerable pyramid: `sp`, 72 properties, and the forms `sp-log` and `sp-energy`.
 
 use std::f64::consts::{FRAC_PI_2, PI};
+use std::ops::Range;
 use std::sync::Arc;
 
 use rustfft::num_complex::Complex;
@@ -13,6 +14,8 @@ const ORIENTATIONS: usize = 6;
 /// Thirds of a band's height: top, middle, bottom.
 const ZONES: usize = 3;
 pub const DIMENSIONS: usize = SCALES * ORIENTATIONS * ZONES;
+/// Numbers added, or rows transposed, at a time: a divisor of every band's size.
+const LANES: usize = 8;
 
 /// What is averaged over a zone of a band.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -92,12 +95,12 @@ impl<T: FftNum + Into<f64>> SteerablePyramid<T> {
             *sample = Complex::new(convert(f64::from(value) - 128.0), T::zero());
         }
         // The spectrum stays transposed: (u, v) at u * 128 + v. Filters and bands below are transposed likewise.
-        self.forward.transform(&mut self.spectrum);
+        let spectrum = &*self.forward.transform(&mut self.spectrum);
         let of_scales = properties.chunks_exact_mut(ORIENTATIONS * ZONES);
         for (scale, properties) in self.scales.iter_mut().zip(of_scales) {
             match response {
-                Response::Energy => scale.energies(&self.spectrum, properties),
-                Response::Magnitude | Response::LogMagnitude => scale.magnitudes(&self.spectrum, properties),
+                Response::Energy => scale.energies(spectrum, properties),
+                Response::Magnitude | Response::LogMagnitude => scale.magnitudes(spectrum, properties),
             }
         }
         if response == Response::LogMagnitude {
@@ -117,16 +120,15 @@ impl<T: FftNum + Into<f64>> Scale<T> {
     fn magnitudes(&mut self, spectrum: &[Complex<T>], properties: &mut [f32]) {
         for (pair, properties) in properties.chunks_exact_mut(2 * ZONES).enumerate() {
             let (first, second) = (&self.filters[2 * pair], &self.filters[2 * pair + 1]);
-            for (i, j) in self.plane.rows_of(GRAY_SIZE) {
-                for c in 0..self.size {
+            for (here, full) in halves_of_rows(self.size) {
+                let filters = first[here.clone()].iter().zip(&second[here.clone()]);
+                for ((band, f), (&a, &b)) in self.band[here].iter_mut().zip(&spectrum[full]).zip(filters) {
                     // (a + i b) · F · (−i)⁵ with (−i)⁵ = −i.
-                    let f = spectrum[j + wrap(c, self.size)];
-                    let (a, b) = (first[i + c], second[i + c]);
-                    self.band[i + c] = Complex::new(a * f.im + b * f.re, b * f.im - a * f.re);
+                    *band = Complex::new(a * f.im + b * f.re, b * f.im - a * f.re);
                 }
             }
-            self.plane.transform(&mut self.band);
-            let means = zone_means(&self.band, self.size, |value| (value.re.abs(), value.im.abs()));
+            let band = self.plane.transform(&mut self.band);
+            let means = zone_means(band, self.size, |value| (value.re.abs(), value.im.abs()));
             for (zone, (real, imaginary)) in means.into_iter().enumerate() {
                 properties[zone] = real as f32;
                 properties[ZONES + zone] = imaginary as f32;
@@ -138,14 +140,15 @@ impl<T: FftNum + Into<f64>> Scale<T> {
     fn energies(&mut self, spectrum: &[Complex<T>], properties: &mut [f32]) {
         for (k, properties) in properties.chunks_exact_mut(ZONES).enumerate() {
             let filter = &self.filters[k];
-            for (i, j) in self.plane.rows_of(GRAY_SIZE) {
-                for c in 0..self.size {
-                    let a = if filter[i + c].is_negative() { T::zero() } else { filter[i + c] };
-                    self.band[i + c] = spectrum[j + wrap(c, self.size)] * (a + a);
+            for (here, full) in halves_of_rows(self.size) {
+                let spectrum = spectrum[full].iter().zip(&filter[here.clone()]);
+                for (band, (f, &a)) in self.band[here].iter_mut().zip(spectrum) {
+                    let a = if a.is_negative() { T::zero() } else { a };
+                    *band = f * (a + a);
                 }
             }
-            self.plane.transform(&mut self.band);
-            let means = zone_means(&self.band, self.size, |value| (magnitude(value), T::zero()));
+            let band = self.plane.transform(&mut self.band);
+            let means = zone_means(band, self.size, |value| (magnitude(value), T::zero()));
             for (property, (energy, _)) in properties.iter_mut().zip(means) {
                 *property = energy as f32;
             }
@@ -157,9 +160,17 @@ fn magnitude<T: FftNum + Into<f64>>(value: &Complex<T>) -> T {
     convert(value.norm_sqr().into().sqrt())
 }
 
-/// Where frequency index `c` of a band of `size` lies among the [`GRAY_SIZE`] of the full spectrum.
-fn wrap(c: usize, size: usize) -> usize {
-    if c < size / 2 { c } else { c + GRAY_SIZE - size }
+/// The halves of each row of a band of `size`, of frequencies from 0 up and below 0, and where the same frequencies lie
+/// in the full spectrum.
+fn halves_of_rows(size: usize) -> impl Iterator<Item = (Range<usize>, Range<usize>)> {
+    let half = size / 2;
+    let wrap = move |index: usize| if index < half { index } else { index + GRAY_SIZE - size };
+    (0..size).flat_map(move |row| {
+        [0, half].map(|column| {
+            let (here, full) = (row * size + column, wrap(row) * GRAY_SIZE + wrap(column));
+            (here..here + half, full..full + half)
+        })
+    })
 }
 
 /// Means of `parts(value)` over the three zones of a band. The mean is over rows
@@ -173,14 +184,19 @@ fn zone_means<T: FftNum + Into<f64>>(
         let (top, bottom) = (t * size / ZONES, (t + 1) * size / ZONES);
         let mut sums = (0.0, 0.0);
         for row in band[top * size..bottom * size].chunks_exact(size) {
-            let (mut first, mut second) = (T::zero(), T::zero());
-            for value in row {
-                let (a, b) = parts(value);
-                first = first + a;
-                second = second + b;
+            // One sum a lane: sums in order could not be taken several at once.
+            let mut lanes = [(T::zero(), T::zero()); LANES];
+            for values in row.as_chunks::<LANES>().0 {
+                for ((first, second), value) in lanes.iter_mut().zip(values) {
+                    let (a, b) = parts(value);
+                    *first = *first + a;
+                    *second = *second + b;
+                }
             }
-            sums.0 += Into::<f64>::into(first);
-            sums.1 += Into::<f64>::into(second);
+            for (first, second) in lanes {
+                sums.0 += Into::<f64>::into(first);
+                sums.1 += Into::<f64>::into(second);
+            }
         }
         let count = ((bottom - top) * size * size * size) as f64;
         (sums.0 / count, sums.1 / count)
@@ -193,29 +209,20 @@ impl<T: FftNum> Plane<T> {
         Self { size, scratch: vec![zero(); fft.get_inplace_scratch_len()], transposed: vec![zero(); size * size], fft }
     }
 
-    /// Transforms in place; the result is transposed.
-    fn transform(&mut self, data: &mut [Complex<T>]) {
+    /// The transform of `data`, transposed; `data` is overwritten.
+    fn transform(&mut self, data: &mut [Complex<T>]) -> &mut [Complex<T>] {
         self.fft.process_with_scratch(data, &mut self.scratch);
         transpose(data, &mut self.transposed, self.size);
         self.fft.process_with_scratch(&mut self.transposed, &mut self.scratch);
-        data.copy_from_slice(&self.transposed);
-    }
-
-    /// Start of each row here and of the row of the same frequency in a spectrum `full` wide.
-    fn rows_of(&self, full: usize) -> impl Iterator<Item = (usize, usize)> + use<T> {
-        let size = self.size;
-        (0..size).map(move |r| (r * size, wrap(r, size) * full))
+        &mut self.transposed
     }
 }
 
 fn transpose<T: Copy>(from: &[T], to: &mut [T], size: usize) {
-    const TILE: usize = 8;
-    for row in (0..size).step_by(TILE) {
-        for column in (0..size).step_by(TILE) {
-            for r in row..row + TILE {
-                for c in column..column + TILE {
-                    to[c * size + r] = from[r * size + c];
-                }
+    for (band, rows) in from.chunks_exact(LANES * size).enumerate() {
+        for (column, to) in to.chunks_exact_mut(size).enumerate() {
+            for (i, to) in to[band * LANES..(band + 1) * LANES].iter_mut().enumerate() {
+                *to = rows[i * size + column];
             }
         }
     }

@@ -3,6 +3,7 @@
 use faer::linalg::solvers::DenseSolveCore;
 use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef, Side};
+use multiversion::multiversion;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -132,22 +133,46 @@ pub fn likelihood_and_gradient(
 
     let [d1, d2] = &learning.squared_distance_m2;
     let [mut signal, mut noise, mut length_1, mut length_2] = [0.0; 4];
-    let a = a.col(0);
+    let a = a.col_as_slice(0);
     for j in 0..n {
         noise -= noise_variance * (inverse[(j, j)] - a[j] * a[j]);
         // Half of the diagonal, then the column below it: the matrices are symmetric.
         signal -= 0.5 * (inverse[(j, j)] - a[j] * a[j]) * k[(j, j)];
-        let below = (j + 1)..n;
-        let columns = inverse.col(j).iter().zip(k.col(j).iter()).zip(d1.col(j).iter().zip(d2.col(j).iter()));
-        for (a_i, ((inverse, k), (d1, d2))) in a.iter().zip(columns).skip(below.start) {
-            let mk = (inverse - a_i * a[j]) * k;
-            signal -= mk;
-            length_1 -= mk * d1;
-            length_2 -= mk * d2;
-        }
+        let [inverse, k, d1, d2] = [&inverse, &k, d1, d2].map(|matrix| &matrix.col_as_slice(j)[j + 1..]);
+        let sums = column_sums(inverse, &a[j + 1..], a[j], k, d1, d2);
+        signal -= sums[0];
+        length_1 -= sums[1];
+        length_2 -= sums[2];
     }
     let [l1, l2] = hyperparameters.length_scale_m;
     Ok((likelihood, [2.0 * signal, noise, length_1 / (l1 * l1), length_2 / (l2 * l2)]))
+}
+
+/// Σ M_ij K_ij, Σ M_ij K_ij d1_ij and Σ M_ij K_ij d2_ij over the rows i given, with M_ij = R⁻¹_ij − a_i a_j.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn column_sums(inverse: &[f64], a: &[f64], a_j: f64, k: &[f64], d1: &[f64], d2: &[f64]) -> [f64; 3] {
+    // One sum a lane: sums in order could not be taken several at once.
+    const LANES: usize = 8;
+    let mut lanes = [[0.0; LANES]; 3];
+    let n = inverse.len();
+    let whole = n - n % LANES;
+    for first in (0..whole).step_by(LANES) {
+        let next = |values: &[f64]| -> [f64; LANES] { std::array::from_fn(|lane| values[first..first + LANES][lane]) };
+        let (inverse, a, k, d1, d2) = (next(inverse), next(a), next(k), next(d1), next(d2));
+        for lane in 0..LANES {
+            let mk = (inverse[lane] - a[lane] * a_j) * k[lane];
+            lanes[0][lane] += mk;
+            lanes[1][lane] += mk * d1[lane];
+            lanes[2][lane] += mk * d2[lane];
+        }
+    }
+    for i in whole..n {
+        let mk = (inverse[i] - a[i] * a_j) * k[i];
+        lanes[0][0] += mk;
+        lanes[1][0] += mk * d1[i];
+        lanes[2][0] += mk * d2[i];
+    }
+    lanes.map(|lanes| lanes.iter().sum())
 }
 
 /// Fits every column of `features` (n × d) on its own, in parallel. `on_done` is called once a feature.

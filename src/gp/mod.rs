@@ -15,6 +15,7 @@ use faer::{Mat, MatRef, Par, Side};
 pub use kernel::{Hyperparameters, squared_exponential};
 
 use crate::types::PositionM;
+use kernel::covariances;
 
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum GpError {
@@ -53,15 +54,11 @@ impl LearningPositions {
     /// The kernel matrix K, n × n, lower triangle (the upper one is left zero).
     fn kernel_matrix(&self, hyperparameters: &Hyperparameters) -> Mat<f64> {
         let n = self.len();
-        let variance = hyperparameters.signal_std.powi(2);
-        let [w1, w2] = hyperparameters.length_scale_m.map(|length_m| -0.5 / (length_m * length_m));
         let [d1, d2] = &self.squared_distance_m2;
         let mut k = Mat::zeros(n, n);
         for j in 0..n {
-            let columns = d1.col(j).iter().zip(d2.col(j).iter()).skip(j);
-            for (value, (d1, d2)) in k.col_mut(j).iter_mut().skip(j).zip(columns) {
-                *value = variance * (w1 * d1 + w2 * d2).exp();
-            }
+            let below = &mut k.col_as_slice_mut(j)[j..];
+            covariances(&d1.col_as_slice(j)[j..], &d2.col_as_slice(j)[j..], hyperparameters, below);
         }
         k
     }
@@ -142,10 +139,18 @@ impl<'a> Posterior<'a> {
         let n = self.learning.len();
         let mut mean = Mat::zeros(points.len(), self.weights.ncols());
         let mut variance = Vec::with_capacity(points.len());
+        let mut squared_distance_m2 = [vec![0.0; n], vec![0.0; n]];
         for (chunk, points) in points.chunks(CHUNK).enumerate() {
-            let mut c = Mat::from_fn(n, points.len(), |i, j| {
-                squared_exponential(self.learning.positions[i], points[j], &self.hyperparameters)
-            });
+            let mut c = Mat::zeros(n, points.len());
+            for (j, point) in points.iter().enumerate() {
+                for (axis, squares) in squared_distance_m2.iter_mut().enumerate() {
+                    let to_point =
+                        self.learning.positions.iter().map(|position| (position[axis] - point[axis]).powi(2));
+                    squares.iter_mut().zip(to_point).for_each(|(square, value)| *square = value);
+                }
+                let [d1, d2] = &squared_distance_m2;
+                covariances(d1, d2, &self.hyperparameters, c.col_as_slice_mut(j));
+            }
             mean.as_mut().subrows_mut(chunk * CHUNK, points.len()).copy_from(c.transpose() * &self.weights);
             solve_lower_triangular_in_place(self.factor.L(), c.as_mut(), Par::Seq);
             variance.extend((0..points.len()).map(|j| {

@@ -1,5 +1,6 @@
 //! Which features to keep: backward sequential elimination on validation images.
 
+use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::metrics::component_median;
@@ -17,14 +18,15 @@ pub struct LikelihoodTable {
 
 struct Query {
     truth_m: PositionM,
-    /// Feature × cell.
-    log_likelihood: Vec<f32>,
-    /// Feature × block: the smallest value in each block of [`BLOCK`] cells.
+    /// Block × feature: the values of [`BLOCK`] cells, zeros beyond the last cell. Blocks that could hold the best cell
+    /// are the same for most features, so features lie next to each other.
+    log_likelihood: Vec<[f32; BLOCK]>,
+    /// Feature × block: the smallest value of each block.
     block_minimum: Vec<f32>,
 }
 
-/// Cells a block: a few cache lines, and small against the number of cells.
-const BLOCK: usize = 32;
+/// Cells a block: a cache line, and small against the number of cells.
+const BLOCK: usize = 16;
 
 impl LikelihoodTable {
     pub fn new(features: usize, centers_m: Vec<PositionM>) -> Self {
@@ -35,13 +37,22 @@ impl LikelihoodTable {
     ///
     /// # Panics
     /// When the table is not of that size.
-    pub fn push(&mut self, truth_m: PositionM, log_likelihood: Vec<f32>) {
+    pub fn push(&mut self, truth_m: PositionM, log_likelihood: &[f32]) {
         let cells = self.centers_m.len();
         assert_eq!(log_likelihood.len(), self.features * cells, "one value a feature and cell");
-        let minimum = |block: &[f32]| block.iter().copied().fold(f32::INFINITY, f32::min);
-        let block_minimum =
-            log_likelihood.chunks_exact(cells.max(1)).flat_map(|row| row.chunks(BLOCK).map(minimum)).collect();
-        self.queries.push(Query { truth_m, log_likelihood, block_minimum });
+        let blocks = cells.div_ceil(BLOCK);
+        let mut query = Query {
+            truth_m,
+            log_likelihood: vec![[0.0; BLOCK]; blocks * self.features],
+            block_minimum: Vec::with_capacity(self.features * blocks),
+        };
+        for (r, row) in log_likelihood.chunks_exact(cells.max(1)).enumerate() {
+            for (block, values) in row.chunks(BLOCK).enumerate() {
+                query.log_likelihood[block * self.features + r][..values.len()].copy_from_slice(values);
+                query.block_minimum.push(least_of(values));
+            }
+        }
+        self.queries.push(query);
     }
 
     pub fn queries(&self) -> usize {
@@ -50,10 +61,7 @@ impl LikelihoodTable {
 
     /// The estimate of every query from the features `kept`: the first cell of greatest summed log-likelihood.
     pub fn estimates_m(&self, kept: &[usize]) -> Vec<PositionM> {
-        self.queries
-            .par_iter()
-            .map(|query| self.centers_m[RunningSum::over(query, kept, self.centers_m.len()).best])
-            .collect()
+        self.queries.par_iter().map(|query| self.centers_m[RunningSum::over(query, kept, self).best]).collect()
     }
 }
 
@@ -95,10 +103,9 @@ impl Elimination {
 /// max (S − L_r) ≤ max S − min L_r: blocks that cannot beat the best cell found so far are passed over, which is nearly
 /// all of them. The result is that of the full search, exactly.
 pub fn backward_elimination(table: &LikelihoodTable, on_step: impl Fn(usize)) -> Elimination {
-    let cells = table.centers_m.len();
     let mut kept: Vec<usize> = (0..table.features).collect();
     let mut sums: Vec<RunningSum> =
-        table.queries.par_iter().map(|query| RunningSum::over(query, &kept, cells)).collect();
+        table.queries.par_iter().map(|query| RunningSum::over(query, &kept, table)).collect();
     let mut path = Elimination { removed: Vec::new(), rmse_m: Vec::new() };
     let square = |query: &Query, cell: usize| distance_m(table.centers_m[cell], query.truth_m).powi(2);
     let rmse_m = |sum: f64| (sum / table.queries.len() as f64).sqrt();
@@ -134,70 +141,131 @@ fn median_rmse_m(table: &LikelihoodTable) -> f64 {
     (sum / truths.len() as f64).sqrt()
 }
 
-/// Σ_r L_r over the kept features, for one query.
+/// S = Σ_r L_r over the kept features, for one query.
 struct RunningSum {
-    sum: Vec<f64>,
+    features: usize,
+    /// By blocks, as in [`Query`]; −∞ beyond the last cell.
+    sum: Vec<[f64; BLOCK]>,
     block_maximum: Vec<f64>,
     /// First cell of greatest sum.
     best: usize,
 }
 
 impl RunningSum {
-    fn over(query: &Query, kept: &[usize], cells: usize) -> Self {
-        let mut sum = vec![0.0; cells];
-        for &r in kept {
-            for (sum, &l) in sum.iter_mut().zip(&query.log_likelihood[r * cells..(r + 1) * cells]) {
-                *sum += f64::from(l);
+    fn over(query: &Query, kept: &[usize], table: &LikelihoodTable) -> Self {
+        let (features, cells) = (table.features, table.centers_m.len());
+        let mut sum = vec![[0.0; BLOCK]; cells.div_ceil(BLOCK)];
+        sum.as_flattened_mut()[cells..].fill(f64::NEG_INFINITY);
+        for (sum, values) in sum.iter_mut().zip(query.log_likelihood.chunks_exact(features)) {
+            for &r in kept {
+                sum.iter_mut().zip(&values[r]).for_each(|(sum, &l)| *sum += f64::from(l));
             }
         }
-        let mut running = Self { sum, block_maximum: Vec::new(), best: 0 };
+        let mut running = Self { features, sum, block_maximum: Vec::new(), best: 0 };
         running.summarise();
         running
     }
 
     fn remove(&mut self, query: &Query, r: usize) {
-        let cells = self.sum.len();
-        for (sum, &l) in self.sum.iter_mut().zip(&query.log_likelihood[r * cells..(r + 1) * cells]) {
-            *sum -= f64::from(l);
+        for (sum, values) in self.sum.iter_mut().zip(query.log_likelihood.chunks_exact(self.features)) {
+            sum.iter_mut().zip(&values[r]).for_each(|(sum, &l)| *sum -= f64::from(l));
         }
         self.summarise();
     }
 
     fn summarise(&mut self) {
         self.block_maximum.clear();
-        let maxima = self.sum.chunks(BLOCK).map(|block| block.iter().copied().fold(f64::NEG_INFINITY, f64::max));
-        self.block_maximum.extend(maxima);
+        self.block_maximum.extend(self.sum.iter().map(greatest_of));
         let greatest = self.block_maximum.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        self.best = self.sum.iter().position(|&sum| sum >= greatest).unwrap_or(0);
+        let block = self.block_maximum.iter().position(|&maximum| maximum >= greatest).unwrap_or(0);
+        let within = self.sum.get(block).and_then(|sums| sums.iter().position(|&sum| sum >= greatest));
+        self.best = block * BLOCK + within.unwrap_or(0);
     }
 
     /// First cell of greatest S − L_r.
     fn best_without(&self, query: &Query, r: usize) -> usize {
-        let cells = self.sum.len();
-        let row = &query.log_likelihood[r * cells..(r + 1) * cells];
         let blocks = self.block_maximum.len();
         let minima = &query.block_minimum[r * blocks..(r + 1) * blocks];
-        let start = self.best / BLOCK;
-        let mut best = (f64::NEG_INFINITY, usize::MAX);
-        let mut search = |block: usize| {
-            let from = block * BLOCK;
-            let values = self.sum[from..].iter().zip(&row[from..]).take(BLOCK);
-            for (i, (sum, &l)) in values.enumerate() {
-                let value = sum - f64::from(l);
-                if value > best.0 || (value == best.0 && from + i < best.1) {
-                    best = (value, from + i);
-                }
-            }
-            best.0
-        };
-        let mut bound = search(start);
-        for (block, (maximum, &minimum)) in self.block_maximum.iter().zip(minima).enumerate() {
-            if maximum - f64::from(minimum) >= bound && block != start {
-                bound = search(block);
+        let values = Strided { values: &query.log_likelihood[r..], stride: self.features };
+        first_greatest_difference(&self.sum, values, &self.block_maximum, minima, self.best / BLOCK)
+    }
+}
+
+/// The blocks of one feature.
+#[derive(Clone, Copy)]
+struct Strided<'a> {
+    values: &'a [[f32; BLOCK]],
+    stride: usize,
+}
+
+/// Blocks whose bounds are looked at together.
+const GROUP: usize = 16;
+
+/// The first cell of greatest `sum` − `values`, searched from block `start` on; `maxima` and `minima` are those of the
+/// blocks of `sum` and `values`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn first_greatest_difference(
+    sum: &[[f64; BLOCK]],
+    values: Strided,
+    maxima: &[f64],
+    minima: &[f32],
+    start: usize,
+) -> usize {
+    let mut best = (f64::NEG_INFINITY, start);
+    // Block `start` first, for a bound that hardly any other block reaches.
+    search(start, sum, values, &mut best);
+    for (group, (maxima, minima)) in maxima.chunks(GROUP).zip(minima.chunks(GROUP)).enumerate() {
+        // Without a branch a block.
+        let mut possible = 0_u32;
+        for (i, (maximum, &minimum)) in maxima.iter().zip(minima).enumerate() {
+            possible |= u32::from(maximum - f64::from(minimum) >= best.0) << i;
+        }
+        while possible != 0 {
+            let i = possible.trailing_zeros() as usize;
+            possible &= possible - 1;
+            if maxima[i] - f64::from(minima[i]) >= best.0 {
+                search(group * GROUP + i, sum, values, &mut best);
             }
         }
-        best.1.min(cells.saturating_sub(1))
     }
+    best.1
+}
+
+/// Improves `best`, a value and its cell, by what block `block` holds.
+#[inline(always)]
+fn search(block: usize, sum: &[[f64; BLOCK]], values: Strided, best: &mut (f64, usize)) {
+    let mut differences = sum[block];
+    for (difference, &l) in differences.iter_mut().zip(&values.values[block * values.stride]) {
+        *difference -= f64::from(l);
+    }
+    let greatest = greatest_of(&differences);
+    if greatest > best.0 || (greatest == best.0 && block * BLOCK < best.1) {
+        let first = differences.iter().position(|&difference| difference == greatest).unwrap_or(0);
+        *best = (greatest, block * BLOCK + first);
+    }
+}
+
+/// The greatest of a block, compared in pairs so that several are compared at once.
+#[inline(always)]
+fn greatest_of(block: &[f64; BLOCK]) -> f64 {
+    let mut values = *block;
+    let mut half = BLOCK / 2;
+    while half > 0 {
+        for i in 0..half {
+            values[i] = if values[i + half] > values[i] { values[i + half] } else { values[i] };
+        }
+        half /= 2;
+    }
+    values[0]
+}
+
+/// The least of at most a block.
+fn least_of(values: &[f32]) -> f32 {
+    let mut least = [f32::INFINITY; 4];
+    for (i, &value) in values.iter().enumerate() {
+        least[i % 4] = if value < least[i % 4] { value } else { least[i % 4] };
+    }
+    least.into_iter().fold(f32::INFINITY, f32::min)
 }
 
 #[cfg(test)]
@@ -212,7 +280,7 @@ mod tests {
         for q in 0..6 {
             let q = f64::from(q);
             let truth_m = [0.7 * q, (1.3 * q).rem_euclid(4.0)];
-            let log_likelihood = (0..5 * 25)
+            let log_likelihood: Vec<f32> = (0..5 * 25)
                 .map(|i| {
                     let (r, g) = (f64::from(i / 25), i % 25);
                     let (x, y) = (f64::from(g % 5), f64::from(g / 5));
@@ -220,7 +288,7 @@ mod tests {
                     (-far * (0.2 + 0.1 * r) + 2.5 * (1.7 * q + 2.3 * r + 0.9 * f64::from(g)).sin()) as f32
                 })
                 .collect();
-            table.push(truth_m, log_likelihood);
+            table.push(truth_m, &log_likelihood);
         }
         table
     }
@@ -250,7 +318,7 @@ mod tests {
         };
         for q in 0..12_i32 {
             let truth_m = [f64::from(q * 7 % 25), f64::from(q * 5 % 20)];
-            let log_likelihood = (0..9 * cells)
+            let log_likelihood: Vec<f32> = (0..9 * cells)
                 .map(|i| {
                     let (r, g) = (i / cells, i % cells);
                     let far = (f64::from(g % 25) - truth_m[0]).powi(2) + (f64::from(g / 25) - truth_m[1]).powi(2);
@@ -258,7 +326,7 @@ mod tests {
                     (if coarse { value.round() } else { value }) as f32
                 })
                 .collect();
-            table.push(truth_m, log_likelihood);
+            table.push(truth_m, &log_likelihood);
         }
         table
     }
