@@ -15,22 +15,21 @@ pub struct ErrorFigures {
     pub max_m: f64,
     /// Share of the errors over 10 m.
     pub share_over_10m: f64,
-    /// 1 − RMSE / RMSE of always answering the component-wise median of the true positions: 1 is perfect, 0 knows
-    /// nothing, below 0 misleads.
+    /// 1 − RMSE / RMSE of always giving the same answer, the component-wise median of the learning positions: 1 is
+    /// perfect, 0 knows nothing, below 0 misleads.
     pub skill: f64,
 }
 
 impl ErrorFigures {
-    /// `None` for no estimates.
-    pub fn of(estimates_m: &[PositionM], truth_m: &[PositionM]) -> Option<Self> {
+    /// `know_nothing_m` is the answer that the skill is measured against. `None` for no estimates.
+    pub fn of(estimates_m: &[PositionM], truth_m: &[PositionM], know_nothing_m: PositionM) -> Option<Self> {
         let mut errors_m: Vec<f64> = estimates_m.iter().zip(truth_m).map(|(&e, &t)| distance_m(e, t)).collect();
         if errors_m.is_empty() {
             return None;
         }
         errors_m.sort_by(f64::total_cmp);
         let rmse_m = root_mean_square(&errors_m);
-        let center = component_median(truth_m);
-        let of_median: Vec<f64> = truth_m.iter().map(|&t| distance_m(t, center)).collect();
+        let of_median: Vec<f64> = truth_m.iter().map(|&t| distance_m(t, know_nothing_m)).collect();
         Some(Self {
             n: errors_m.len(),
             rmse_m,
@@ -78,21 +77,21 @@ mod tests {
     fn figures_equal_hand_computed_ones() {
         let truth_m = [[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [20.0, 20.0]];
         let estimates_m = [[0.0, 0.0], [13.0, 4.0], [0.0, 11.0], [20.0, 32.0]];
-        let figures = ErrorFigures::of(&estimates_m, &truth_m).expect("there are estimates");
+        let figures = ErrorFigures::of(&estimates_m, &truth_m, [5.0, 5.0]).expect("there are estimates");
         // Errors 0, 5, 1, 12.
         assert_eq!((figures.n, figures.max_m, figures.share_over_10m), (4, 12.0, 0.25));
         assert!((figures.rmse_m - (170.0_f64 / 4.0).sqrt()).abs() < 1e-12);
         assert_eq!(figures.median_m, 3.0);
         assert!((figures.p90_m - (5.0 + 0.7 * 7.0)).abs() < 1e-12);
-        // The median position is (5, 5): distances² 50, 50, 50, 450.
+        // From (5, 5): distances² 50, 50, 50, 450.
         assert!((figures.skill - (1.0 - (170.0_f64 / 600.0).sqrt())).abs() < 1e-12);
-        assert_eq!(ErrorFigures::of(&[], &[]), None);
+        assert_eq!(ErrorFigures::of(&[], &[], [0.0; 2]), None);
     }
 
     #[test]
     fn always_the_median_has_no_skill() {
         let truth_m = [[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]];
-        let figures = ErrorFigures::of(&[[0.0, 0.0]; 3], &truth_m).expect("there are estimates");
+        let figures = ErrorFigures::of(&[[0.0, 0.0]; 3], &truth_m, [0.0, 0.0]).expect("there are estimates");
         assert!(figures.skill.abs() < 1e-12);
     }
 

@@ -122,7 +122,7 @@ fn what_cannot_be_trained_is_refused_and_leaves_nothing() {
             vec![row(0, "0,0"), row(1, "1,0"), row(2, "2,0"), row(3, "3,0")],
             &["--grid-step-m", "0"],
             2,
-            "grid step 0 m",
+            "expected 0.001 to 10000 m",
         ),
     ];
     for (case, rows, arguments, expected_code, expected) in table {

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use serde_json::json;
 
-use super::options::{OutputKind, check_output};
+use super::options::{OutputKind, check_not_input, check_output};
 use super::{BadArgument, frame_source, print};
 use crate::calibrate::{DonutEstimate, DonutFinder, FindDonutError, Orientation, Verdict, overlay};
 use crate::recording::{RecordingError, write_file_atomically};
@@ -79,6 +79,7 @@ struct Outcome {
 pub fn run(args: &CalibrateArgs) -> anyhow::Result<ExitCode> {
     for path in [&args.out, &args.overlay] {
         check_output(path, OutputKind::File, args.force)?;
+        check_not_input(path, &args.input)?;
     }
     if let Some(angle) = args.start_angle.filter(|angle| !angle.is_finite()) {
         return Err(BadArgument(format!("--start-angle is {angle}, expected a finite number")).into());

@@ -41,7 +41,19 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     step("the recording becomes a map", &["train", &recording, "--out", &map, "--force"])?;
     step(
         "how well would it localize? The paper's protocol: learn from half of the frames, choose on a quarter, test on the rest",
-        &["evaluate", &recording, "--split", "random", "--variants", "plain", "--seeds", "2", "--json", &results],
+        &[
+            "evaluate",
+            &recording,
+            "--split",
+            "random",
+            "--variants",
+            "plain",
+            "--seeds",
+            "2",
+            "--json",
+            &results,
+            "--force",
+        ],
     )?;
     print(&format!(
         "\nWhat this shows: real photographs go all the way to positions. With neighbours about 10 m apart and phone GPS of\n\

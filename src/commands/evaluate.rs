@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use serde_json::json;
 
-use super::options::check_input;
+use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
 use super::survey::{
     bad_argument, default_grid_step_m, open_recordings, parse_descriptor, read_to_learn, read_to_match, read_truth,
@@ -33,10 +33,14 @@ pub struct Args {
     #[arg(required = true, value_name = "REC.mcap")]
     pub recordings: Vec<PathBuf>,
     /// Measure against this map, frame by frame
-    #[arg(long, value_name = "AREA.map")]
+    #[arg(
+        long,
+        value_name = "AREA.map",
+        conflicts_with_all = ["recipe", "features", "select", "split", "seed", "seeds", "variants", "grid_step_m"]
+    )]
     pub map: Option<PathBuf>,
-    /// Recipes to compare
-    #[arg(long, value_enum, value_delimiter = ',', default_values = ["paper", "default"])]
+    /// Recipes to compare, separated by commas [default: paper,default]
+    #[arg(long, value_enum, value_delimiter = ',', default_values = ["paper", "default"], hide_default_value = true)]
     pub recipe: Vec<RecipeName>,
     /// Feature types, in place of the recipes' own
     #[arg(long, value_delimiter = ',', value_parser = parse_descriptor)]
@@ -44,8 +48,9 @@ pub struct Args {
     /// How features are chosen [default: backward for the paper's recipe, none for the default one]
     #[arg(long, value_enum)]
     pub select: Option<Selection>,
-    /// How frames are split: random, blocked, or a CSV file `index,set` with learning, validation, test
-    #[arg(long, value_delimiter = ',', default_values = ["random", "blocked"])]
+    /// How frames are split: random, blocked, or a CSV file `index,set` with learning, validation, test; several are
+    /// separated by commas [default: random,blocked]
+    #[arg(long, value_delimiter = ',', default_values = ["random", "blocked"], hide_default_value = true)]
     pub split: Vec<String>,
     /// First seed of the splits
     #[arg(long, default_value_t = 0)]
@@ -54,11 +59,18 @@ pub struct Args {
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub seeds: u64,
     /// Variants of the random split: plain; noisy, with 0.3 m of noise on all positions; fixed, with every panorama
-    /// turned by its yaw
-    #[arg(long, value_enum, value_delimiter = ',', default_values = ["plain", "noisy", "fixed"])]
+    /// turned by its yaw [default: plain,noisy,fixed]
+    #[arg(
+        long,
+        value_enum,
+        value_delimiter = ',',
+        default_values = ["plain", "noisy", "fixed"],
+        hide_default_value = true,
+        hide_possible_values = true
+    )]
     pub variants: Vec<Variant>,
     /// Distance of neighbouring candidate cells [m; default: 1 outdoors, 0.1 where the positions lie within 20 m]
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub grid_step_m: Option<f64>,
     /// Measure errors against these positions (CSV `index,x_m,y_m`) instead of the recorded ones
     #[arg(long, value_name = "CSV")]
@@ -69,6 +81,9 @@ pub struct Args {
     /// Put every test frame's estimate into the JSON
     #[arg(long, requires = "json")]
     pub frames: bool,
+    /// Replace the JSON file if it exists
+    #[arg(long)]
+    pub force: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -101,6 +116,9 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
         return Err(BadArgument("--truth goes with one recording".into()).into());
     }
     if let Some(json) = &args.json {
+        check_output(json, OutputKind::File, args.force)?;
+        let inputs = args.recordings.iter().chain(&args.map).chain(&args.truth);
+        check_not_input(json, inputs)?;
         let folder = json.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if !folder.is_dir() {
             return Err(
@@ -127,6 +145,9 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
 /// Every frame of `recording` against a map.
 fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) -> anyhow::Result<Vec<Entry>> {
     let map = open_map(path)?;
+    if map.info.recordings.iter().any(|trained_on| trained_on.name == recording.name) {
+        eprintln!("warning: the map was trained on {}: it knows these frames, and the errors flatter", recording.name);
+    }
     let descriptors = map.info.groups.iter().map(|group| group.recipe.descriptor).collect();
     let survey = read_to_match(recording, descriptors, progress)?;
     map.info
@@ -142,6 +163,7 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
         n_test: survey.len(),
         ..Entry::default()
     };
+    let know_nothing_m = component_median(&map.positions_m);
     let mut entries: Vec<Entry> = against_map(&survey, &map)
         .into_iter()
         .map(|outcome| {
@@ -154,7 +176,7 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
                 compression: compression(outcome.m, outcome.kept),
                 ..base.clone()
             };
-            let entry = entry.with_figures(ErrorFigures::of(&outcome.estimates_m, &truth_m));
+            let entry = entry.with_figures(ErrorFigures::of(&outcome.estimates_m, &truth_m, know_nothing_m));
             if args.frames { entry.with_frames(&indices, &truth_m, &outcome.estimates_m) } else { entry }
         })
         .collect();
@@ -260,17 +282,21 @@ fn trial_entries(
         n_learned_from: case.split.learning.len(),
         ..Entry::default()
     };
+    let know_nothing_m = component_median(&pick(&case.split.learning, &recorded_m));
     let mut entries = Vec::new();
     for recipe in recipes {
-        let part = match case.seed {
-            Some(seed) => format!("{} {} {seed}", recipe.name.name(), case.split_name),
-            None => recipe.name.name().to_owned(),
+        let variant = match case.variant {
+            Variant::Plain => "",
+            Variant::Noisy => " (noisy)",
+            Variant::Fixed => " (fixed)",
         };
+        let seed = case.seed.map(|seed| format!(", seed {seed}")).unwrap_or_default();
+        let part = format!("{}, {}{variant}{seed}", recipe.name.name(), case.split_name);
         let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &recorded_m };
         let outcomes = run_trial(survey, &trial, |step| progress.step(&part, step)).map_err(bad_argument)?;
         for outcome in &outcomes.rows {
             let base = Entry { n_learned_from: outcomes.learned_from, ..base.clone() };
-            let entry = outcome_entry(base, recipe, outcome, &validation_m, &test_m);
+            let entry = outcome_entry(base, recipe, outcome, &validation_m, &test_m, know_nothing_m);
             let estimates_m = estimates_of(recipe, outcome);
             entries.push(if args.frames { entry.with_frames(&indices, &test_m, estimates_m) } else { entry });
         }
@@ -293,9 +319,11 @@ fn outcome_entry(
     outcome: &Outcome,
     validation_m: &[PositionM],
     test_m: &[PositionM],
+    know_nothing_m: PositionM,
 ) -> Entry {
-    let rmse_m =
-        |estimates_m: &[PositionM], truth_m: &[PositionM]| ErrorFigures::of(estimates_m, truth_m).map(|f| f.rmse_m);
+    let rmse_m = |estimates_m: &[PositionM], truth_m: &[PositionM]| {
+        ErrorFigures::of(estimates_m, truth_m, know_nothing_m).map(|f| f.rmse_m)
+    };
     let selects = recipe.selection != Selection::None;
     let entry = Entry {
         recipe: Some(recipe.name.name()),
@@ -311,14 +339,14 @@ fn outcome_entry(
         bic_kept: outcome.bic_kept.filter(|_| selects),
         ..base
     };
-    entry.with_figures(ErrorFigures::of(estimates_of(recipe, outcome), test_m))
+    entry.with_figures(ErrorFigures::of(estimates_of(recipe, outcome), test_m, know_nothing_m))
 }
 
 /// The row of always answering the median of the learning positions.
 fn median_entry(base: Entry, learning_m: &[PositionM], truth_m: &[PositionM]) -> Entry {
     let median_m = component_median(learning_m);
     let answers = vec![median_m; truth_m.len()];
-    Entry { features: "median".into(), ..base }.with_figures(ErrorFigures::of(&answers, truth_m))
+    Entry { features: "median".into(), ..base }.with_figures(ErrorFigures::of(&answers, truth_m, median_m))
 }
 
 fn compression(m: usize, kept: usize) -> Option<f64> {

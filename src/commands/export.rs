@@ -6,7 +6,7 @@ use clap::ValueEnum;
 
 use super::{
     BadArgument, DONE,
-    options::{OutputKind, check_input, check_output, parse_origin},
+    options::{OutputKind, check_input, check_not_input, check_output, parse_origin},
     print,
 };
 use crate::{
@@ -60,6 +60,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         To::Images => (Format::Images, OutputKind::Folder),
     };
     check_output(&args.out, kind, args.force)?;
+    check_not_input(&args.out, [&args.recording])?;
     let recording = Recording::open_any(&args.recording)?;
     let report = export(&recording, format, &args.out, args.origin).map_err(|error| match error {
         ExportError::NoOrigin { .. } => BadArgument(error.to_string()).into(),

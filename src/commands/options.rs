@@ -1,6 +1,9 @@
 //! Argument values that several commands take.
 
-use std::{fs, path::Path};
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
 
 use super::BadArgument;
 use crate::types::Geodetic;
@@ -18,10 +21,15 @@ pub fn parse_origin(text: &str) -> Result<Geodetic, String> {
     if origin.is_plausible() { Ok(origin) } else { Err(expected.into()) }
 }
 
-/// Refuses an input that is not there.
+/// Refuses an input that is not there, and one that could be waited for forever, such as a pipe.
 pub fn check_input(path: &Path) -> Result<(), BadArgument> {
-    match path.try_exists() {
-        Ok(false) => Err(BadArgument(format!("{}: no such file or folder", path.display()))),
+    match fs::metadata(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+            Err(BadArgument(format!("{}: no such file or folder", path.display())))
+        }
+        Ok(facts) if !facts.is_file() && !facts.is_dir() => {
+            Err(BadArgument(format!("{}: not a regular file", path.display())))
+        }
         _ => Ok(()),
     }
 }
@@ -49,6 +57,19 @@ pub fn check_output(out: &Path, kind: OutputKind, force: bool) -> Result<(), Bad
             let expected = if kind == OutputKind::File { "a regular file" } else { "a folder" };
             Err(BadArgument(format!("--out {}: exists and is not {expected}; choose another name", out.display())))
         }
+    }
+}
+
+/// Refuses an output that is one of the inputs, under whatever name.
+pub fn check_not_input<'a>(out: &Path, inputs: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), BadArgument> {
+    let Ok(target) = fs::canonicalize(out) else { return Ok(()) };
+    match inputs.into_iter().find(|input| fs::canonicalize(input).is_ok_and(|input| input == target)) {
+        Some(input) => Err(BadArgument(format!(
+            "{} is the input {}: it would be overwritten; choose another name",
+            out.display(),
+            input.display()
+        ))),
+        None => Ok(()),
     }
 }
 

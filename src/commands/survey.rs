@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 
 use super::BadArgument;
-use super::options::check_input;
+use super::options::{check_input, check_not_input};
 use super::progress::Progress;
 use crate::features::Descriptor;
 use crate::map::{PERTURBED_COPIES, Recipe};
@@ -15,6 +15,9 @@ use crate::types::PositionM;
 
 /// Opens `paths`, all of which must be usable.
 pub fn open_recordings(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
+    for (i, path) in paths.iter().enumerate() {
+        check_not_input(path, &paths[..i]).map_err(|_| BadArgument(format!("{} is named twice", path.display())))?;
+    }
     paths
         .iter()
         .map(|path| {
@@ -115,5 +118,11 @@ pub fn read_truth(path: &std::path::Path, survey: &Survey) -> anyhow::Result<Vec
     let of_frame = |index: usize| {
         truth.get(&index).copied().with_context(|| format!("{}: no line for frame {index}", path.display()))
     };
-    survey.frames.iter().map(|frame| of_frame(frame.index)).collect()
+    let positions_m: Vec<PositionM> =
+        survey.frames.iter().map(|frame| of_frame(frame.index)).collect::<anyhow::Result<_>>()?;
+    if truth.len() > positions_m.len() {
+        let extra = truth.len() - positions_m.len();
+        eprintln!("warning: {}: {extra} lines belong to no frame; is it the truth of this recording?", path.display());
+    }
+    Ok(positions_m)
 }

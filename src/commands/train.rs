@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use super::map_report;
-use super::options::{OutputKind, check_output};
+use super::options::{OutputKind, check_not_input, check_output};
 use super::progress::Progress;
 use super::survey::{bad_argument, default_grid_step_m, open_recordings, parse_descriptor, read_to_learn};
 use super::{DONE, print};
@@ -42,18 +42,22 @@ pub struct Args {
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
     /// Distance of neighbouring candidate cells [m; default: 1 outdoors, 0.1 where the positions lie within 20 m]
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub grid_step_m: Option<f64>,
     /// Candidate cells are at most this far from a learning position [m; default: 7 times the positions' spacing]
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub within_m: Option<f64>,
     /// Replace the output if it exists
     #[arg(long)]
     pub force: bool,
 }
 
+/// A map of less skill than this is warned about.
+const MIN_SKILL: f64 = 0.5;
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_output(&args.out, OutputKind::File, args.force)?;
+    check_not_input(&args.out, &args.recordings)?;
     let recipe = Recipe::new(args.recipe, &args.features);
     let recipe = match args.select {
         Some(selection) => recipe.with_selection(selection),
@@ -76,6 +80,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         out.write_all(&bytes).map_err(|cause| RecordingError::CannotWrite { path: args.out.clone(), cause })
     })?;
     progress.finish();
+    if let Some(figures) = map.info.validation.last().filter(|figures| figures.skill < MIN_SKILL) {
+        eprintln!(
+            "warning: on the frames held back the map errs by {:.1} m (RMSE), hardly less than always answering the median \
+             position: the frames are too far apart, too few, or their positions are wrong",
+            figures.rmse_m
+        );
+    }
     print(&map_report::as_text(&args.out, &map, bytes.len() as u64))?;
     Ok(DONE.into())
 }

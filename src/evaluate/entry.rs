@@ -129,9 +129,10 @@ fn heading(first: &Entry, seeds: usize) -> String {
         (None, _) => format!("against a map: {} frames", first.n_test),
     };
     format!(
-        "\n{title}\n{:8} {:26} {:>5} {:>5} {:>12} {:>7} {:>7} {:>7} {:>7} | {:>7} {:>7} {:>7} {:>7} {:>6} {:>6} | {:>8} {:>8}\n",
+        "\n{title}\n{:8} {:26} {:>6} {:>5} {:>5} {:>12} {:>7} {:>7} {:>7} {:>7} | {:>7} {:>7} {:>7} {:>7} {:>6} {:>6} | {:>8} {:>8}\n",
         "recipe",
         "features",
+        "images",
         "m",
         "rank",
         "kept",
@@ -179,9 +180,10 @@ fn line(rows: &[&Entry]) -> String {
         _ => "",
     };
     format!(
-        "{:8} {:26} {} {} {kept:>12} {} {} {} {} | {} {} {} {} {} {} | {} {}\n",
+        "{:8} {:26} {:>6} {} {} {kept:>12} {} {} {} {} | {} {} {} {} {} {} | {} {}\n",
         first.recipe.unwrap_or("-"),
         format!("{}{variant}", first.features),
+        first.n_learned_from,
         number(count(|e| e.m), 5, 0),
         number(count(|e| e.rank), 5, 0),
         meters(&|e| e.rmse_all_test_m),
@@ -201,10 +203,11 @@ fn line(rows: &[&Entry]) -> String {
 
 /// What the columns mean, for under the tables.
 pub const LEGEND: &str = "\
-All errors in metres. m properties, rank after scaling, kept by the selection (m / kept). RMSE: all T with all features on
+All errors in metres. images: what the tested model was learned from; the default recipe chooses nothing on the
+validation frames, so that, once measured on them (BE V), it learns from them too. m properties, rank after scaling, kept by the selection (m / kept). RMSE: all T with all features on
 the test frames; BE V and BE T with the features kept, on validation and test frames; e_max the largest test error.
 Right of the bar, the estimate the recipe stands for. skill: 1 - RMSE / RMSE of always answering the median position;
-1 is perfect, 0 knows nothing. The validation figures are of frames that features were chosen on: they flatter.
+1 is perfect, 0 knows nothing. Where features are chosen, BE V is of the frames they were chosen on: it flatters.
 ";
 
 #[cfg(test)]

@@ -341,14 +341,17 @@ pub fn extent_m(positions: &[PositionM]) -> [f64; 2] {
     [east.max(least), north.max(least)]
 }
 
-/// Median over the positions of the distance to the nearest other position \[m\]; zero for fewer than two.
+/// Positions closer than this are one place: a receiver slower than the camera repeats its fixes.
+const SAME_PLACE_M: f64 = 1e-6;
+
+/// Median over the positions of the distance to the nearest position elsewhere \[m\]: several images of one place count as
+/// one place. Zero where all positions are one.
 pub fn median_neighbour_spacing_m(positions: &[PositionM]) -> f64 {
     let mut nearest: Vec<f64> = positions
         .iter()
-        .enumerate()
-        .filter_map(|(i, &p)| {
-            let others = positions.iter().enumerate().filter(|&(j, _)| j != i);
-            others.map(|(_, &q)| crate::types::distance_m(p, q)).min_by(f64::total_cmp)
+        .filter_map(|&p| {
+            let distances = positions.iter().map(|&q| crate::types::distance_m(p, q));
+            distances.filter(|&distance_m| distance_m > SAME_PLACE_M).min_by(f64::total_cmp)
         })
         .collect();
     nearest.sort_by(f64::total_cmp);
@@ -425,6 +428,13 @@ mod tests {
         let bounded = Bounds { min_length_scale_m: 1.5, ..Bounds::PAPER };
         let fit = &fit_each(&learning, noise.as_ref(), &bounded, || {})[0];
         assert!(!fit.warnings.contains(&Warning::LengthScaleBelowSpacing), "{fit:?}");
+    }
+
+    #[test]
+    fn repeated_positions_do_not_shrink_the_spacing() {
+        let held: Vec<PositionM> = (0..30).map(|i| [f64::from(i / 3) * 2.0, 0.0]).collect();
+        assert_eq!(median_neighbour_spacing_m(&held), 2.0);
+        assert_eq!(median_neighbour_spacing_m(&[[1.0, 1.0]; 4]), 0.0);
     }
 
     #[test]

@@ -3,5 +3,5 @@
 mod decode;
 mod markers;
 
-pub use decode::{JpegError, LumaDecoder};
+pub use decode::{JpegError, LumaDecoder, MAX_SIDE_PX};
 pub use markers::{JpegInfo, MarkerError, scan, with_huffman_tables};

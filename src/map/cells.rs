@@ -23,14 +23,23 @@ pub struct Grid {
 
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CellsError {
-    #[error("grid step {step_m} m: expected a positive number")]
+    #[error("grid step {step_m:e} m: expected {MIN_STEP_M} to {MAX_STEP_M} m")]
     BadStep { step_m: f64 },
     #[error(
         "{cells:.0} candidate cells at a grid step of {step_m} m are more than {MAX_CELLS}; use a larger --grid-step-m"
     )]
     TooMany { cells: f64, step_m: f64 },
+    #[error(
+        "no cell lies within {within_m} m of a learning position: expected a positive number, such as the grid step"
+    )]
+    NoneNear { within_m: f64 },
 }
 
+/// A step outside these bounds is a mistake.
+const MIN_STEP_M: f64 = 1e-3;
+const MAX_STEP_M: f64 = 1e4;
+/// Further from the origin than this is no position on Earth.
+const MAX_COORDINATE_M: f64 = 1e8;
 /// More cells than this are a mistake in the step or the positions.
 const MAX_CELLS: u32 = 4_000_000;
 
@@ -40,7 +49,7 @@ impl CandidateCells {
     /// # Errors
     /// When the step is not positive, or so small that the grid would not fit.
     pub fn around(positions: &[PositionM], step_m: f64, within_m: Option<f64>) -> Result<Self, CellsError> {
-        if !(step_m.is_finite() && step_m > 0.0) {
+        if !(MIN_STEP_M..=MAX_STEP_M).contains(&step_m) {
             return Err(CellsError::BadStep { step_m });
         }
         let bound =
@@ -58,7 +67,11 @@ impl CandidateCells {
             let center = grid.center_m(*cell);
             within_m.is_none_or(|within_m| positions.iter().any(|&p| distance_m(p, center) <= within_m))
         };
-        Ok(Self { grid, cells: all.filter(near).collect() })
+        let cells: Vec<[u32; 2]> = all.filter(near).collect();
+        match within_m {
+            Some(within_m) if cells.is_empty() => Err(CellsError::NoneNear { within_m }),
+            _ => Ok(Self { grid, cells }),
+        }
     }
 
     /// Cells read from a file.
@@ -66,15 +79,15 @@ impl CandidateCells {
     /// # Errors
     /// Says which cell lies outside the grid or out of order.
     pub fn from_parts(grid: Grid, cells: Vec<[u32; 2]>) -> Result<Self, String> {
+        if !grid.is_plausible() {
+            return Err(format!("impossible grid: {} m steps, {} x {} cells", grid.step_m, grid.columns, grid.rows));
+        }
         let ordered = cells.windows(2).all(|pair| (pair[0][1], pair[0][0]) < (pair[1][1], pair[1][0]));
         if let Some(cell) = cells.iter().find(|cell| cell[0] >= grid.columns || cell[1] >= grid.rows) {
             return Err(format!("cell {cell:?} outside the grid of {} x {}", grid.columns, grid.rows));
         }
         if !ordered || cells.is_empty() {
             return Err("the cells are not in order".into());
-        }
-        if !(grid.step_m.is_finite() && grid.step_m > 0.0 && grid.origin_m.iter().all(|o| o.is_finite())) {
-            return Err(format!("impossible grid {grid:?}"));
         }
         Ok(Self { grid, cells })
     }
@@ -107,6 +120,14 @@ impl CandidateCells {
 }
 
 impl Grid {
+    /// A grid that training could have made.
+    fn is_plausible(&self) -> bool {
+        let cells = u64::from(self.columns) * u64::from(self.rows);
+        (MIN_STEP_M..=MAX_STEP_M).contains(&self.step_m)
+            && self.origin_m.iter().all(|o| o.abs() <= MAX_COORDINATE_M)
+            && (1..=u64::from(MAX_CELLS)).contains(&cells)
+    }
+
     fn center_m(&self, [i, j]: [u32; 2]) -> PositionM {
         [self.origin_m[0] + self.step_m * f64::from(i), self.origin_m[1] + self.step_m * f64::from(j)]
     }

@@ -137,6 +137,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<FeatureMap, MapError> {
         return Err(MapError::Checksum);
     }
     let info: MapInfo = serde_json::from_value(json).map_err(|error| MapError::Damaged(error.to_string()))?;
+    info.check().map_err(MapError::Damaged)?;
     Parts { tensors }.into_map(info)
 }
 
@@ -164,6 +165,9 @@ impl Parts<'_> {
         let damaged = |problem: String| MapError::Damaged(problem);
         let (positions, shape) = self.numbers("positions_m", Dtype::F64, f64::from_le_bytes)?;
         let n = self.rows("positions_m", &shape, 2)?;
+        if n == 0 {
+            return Err(damaged("it has no learning positions".into()));
+        }
         let (cells, shape) = self.numbers("cells", Dtype::U32, u32::from_le_bytes)?;
         let c = self.rows("cells", &shape, 2)?;
         let cells = cells.chunks_exact(2).map(|pair| [pair[0], pair[1]]).collect();

@@ -19,6 +19,8 @@ pub use recipe::{
 };
 
 use crate::features::scaling::Scaling;
+use crate::gp::Hyperparameters;
+use crate::jpeg::MAX_SIDE_PX;
 use crate::types::{DonutCalibration, Geodetic, PositionM};
 
 #[derive(Debug, Clone)]
@@ -90,6 +92,8 @@ pub struct ValidationFigures {
     pub median_m: f64,
     pub p95_m: f64,
     pub share_over_10m: f64,
+    /// 1 − RMSE / RMSE of always answering the median of the learning positions.
+    pub skill: f64,
 }
 
 /// Donuts whose centre or radii differ by more than this are of another lens, or of one that was moved \[px\].
@@ -107,13 +111,59 @@ pub struct OtherLens {
 }
 
 impl MapInfo {
+    /// Refuses what no training writes: a file may hold anything. The grid is checked with its cells.
+    fn check(&self) -> Result<(), String> {
+        let [width_px, height_px] = self.image_size_px;
+        if width_px > MAX_SIDE_PX || height_px > MAX_SIDE_PX {
+            return Err(format!("images of {width_px} x {height_px} px"));
+        }
+        self.calibration.check_in_image(width_px, height_px).map_err(|error| error.to_string())?;
+        if self.origin.is_some_and(|origin| !origin.is_plausible()) {
+            return Err("its origin is not on Earth".into());
+        }
+        if self.groups.is_empty() || self.recordings.is_empty() {
+            return Err("it has no groups of features, or no recordings".into());
+        }
+        for (i, group) in self.groups.iter().enumerate() {
+            let name = group.recipe.descriptor;
+            if self.groups[..i].iter().any(|other| other.recipe.descriptor == name) {
+                return Err(format!("{name} is there twice"));
+            }
+            if !(1..=group.rank).contains(&group.features) || group.rank > name.dimensions() {
+                let (features, rank, m) = (group.features, group.rank, name.dimensions());
+                return Err(format!("{name}: {features} features of rank {rank} from {m} properties"));
+            }
+            if !(1e-6..=1e6).contains(&group.recipe.weight) {
+                return Err(format!("{name}: weight {:e}", group.recipe.weight));
+            }
+            let fitted: Vec<Hyperparameters> = match &group.hyperparameters {
+                GroupHyperparameters::Shared(shared) => vec![*shared],
+                GroupHyperparameters::Each(fits) if fits.len() == group.features => {
+                    fits.iter().map(|fit| fit.hyperparameters).collect()
+                }
+                GroupHyperparameters::Each(fits) => {
+                    return Err(format!("{name}: {} fits of {} features", fits.len(), group.features));
+                }
+            };
+            let positive = |values: &Hyperparameters| {
+                let [l1, l2] = values.length_scale_m;
+                [values.signal_std, values.noise_std, l1, l2].iter().all(|value| value.is_finite() && *value > 0.0)
+            };
+            if !fitted.iter().all(positive) {
+                return Err(format!("{name}: hyperparameters that are not positive"));
+            }
+        }
+        Ok(())
+    }
+
     /// Refuses frames of a camera that the map does not fit: other image size, other donut.
     pub fn check_lens(&self, donut: &DonutCalibration, image_size_px: (usize, usize)) -> Result<(), OtherLens> {
         let ours = &self.calibration;
         let other = |what, found: String, expected: String| Err(OtherLens { what, found, expected });
         if image_size_px != self.image_size_px.into() {
-            let expected = (self.image_size_px[0], self.image_size_px[1]);
-            return other("the image size", format!("{image_size_px:?} px"), format!("{expected:?} px"));
+            let size = |width_px, height_px| format!("{width_px} x {height_px} px");
+            let found = size(image_size_px.0, image_size_px.1);
+            return other("the image size", found, size(self.image_size_px[0], self.image_size_px[1]));
         }
         for (what, found, expected) in [
             ("the centre's x", donut.center_x_px, ours.center_x_px),
@@ -136,7 +186,6 @@ impl MapInfo {
 pub(crate) mod tests {
     use super::*;
     use crate::features::Descriptor;
-    use crate::gp::Hyperparameters;
     use crate::types::{AzimuthSense, LensKind};
 
     /// Three positions, two features of `sp`.

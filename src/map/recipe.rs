@@ -95,11 +95,19 @@ pub struct NoiseWhiteningSettings {
 }
 
 impl Recipe {
-    /// The recipe `name` over `descriptors`; the recipe's own choice where that is empty.
+    /// The recipe `name` over `descriptors`, each once; the recipe's own choice where that is empty.
     pub fn new(name: RecipeName, descriptors: &[Descriptor]) -> Self {
+        let mut descriptors = descriptors.to_vec();
+        let mut seen = Vec::new();
+        descriptors.retain(|descriptor| {
+            !seen.contains(descriptor) && {
+                seen.push(*descriptor);
+                true
+            }
+        });
         match name {
-            RecipeName::Paper => Self::paper(if descriptors.is_empty() { &Descriptor::PAPER } else { descriptors }),
-            RecipeName::Default => Self::default_over(if descriptors.is_empty() { &DEFAULT } else { descriptors }),
+            RecipeName::Paper => Self::paper(if descriptors.is_empty() { &Descriptor::PAPER } else { &descriptors }),
+            RecipeName::Default => Self::default_over(if descriptors.is_empty() { &DEFAULT } else { &descriptors }),
         }
     }
 

@@ -24,7 +24,7 @@ use crate::map::{
     CandidateCells, FORMAT_VERSION, FeatureMap, GroupInfo, MapGroup, MapInfo, Recipe, Selection, SplitKind, TrainedOn,
     ValidationFigures,
 };
-use crate::metrics::ErrorFigures;
+use crate::metrics::{ErrorFigures, component_median};
 
 /// Choices of a training run.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -61,9 +61,11 @@ pub fn train(
     let trial =
         Trial { recipe: &held_back, split: &split, grid_step_m: settings.grid_step_m, recorded_m: &positions_m };
     let outcomes = run(survey, &trial, &on_step)?;
+    let learning_m: Vec<_> = split.learning.iter().map(|&row| positions_m[row]).collect();
+    let know_nothing_m = component_median(&learning_m);
     let truth_m: Vec<_> = split.validation.iter().map(|&row| positions_m[row]).collect();
     let validation = outcomes.rows.iter().filter_map(|row| {
-        let figures = ErrorFigures::of(&row.kept_validation_m, &truth_m)?;
+        let figures = ErrorFigures::of(&row.kept_validation_m, &truth_m, know_nothing_m)?;
         Some(ValidationFigures {
             features: row.features.clone(),
             frames: figures.n,
@@ -71,6 +73,7 @@ pub fn train(
             median_m: figures.median_m,
             p95_m: figures.p95_m,
             share_over_10m: figures.share_over_10m,
+            skill: figures.skill,
         })
     });
     let validation = validation.collect();
