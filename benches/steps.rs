@@ -47,7 +47,12 @@ fn textured_jpeg(seed: u64) -> Vec<u8> {
         .map(|i| {
             let frequency = 0.01 * 1.2_f64.powi(i);
             let direction = TAU * random.random::<f64>();
-            [frequency * direction.cos(), frequency * direction.sin(), TAU * random.random::<f64>(), 30.0 / f64::from(i + 2).sqrt()]
+            [
+                frequency * direction.cos(),
+                frequency * direction.sin(),
+                TAU * random.random::<f64>(),
+                30.0 / f64::from(i + 2).sqrt(),
+            ]
         })
         .collect();
     let mut rgb = Vec::with_capacity(SIZE.0 * SIZE.1 * 3);
