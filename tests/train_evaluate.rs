@@ -198,6 +198,48 @@ fn damaged_foreign_and_missing_maps_are_refused() {
     assert!(code == 1 && stderr.contains("the map is of another lens"), "{stderr}");
 }
 
+/// A receiver slower than the camera repeats its fixes: the spacing must not collapse.
+#[test]
+fn held_positions_still_make_a_map() {
+    let dataset = TinyDataset::new();
+    let rows: Vec<String> = (0..12)
+        .map(|index| {
+            dataset.write(&format!("images/{index:04}.jpg"), &jpeg(96, 96, index));
+            format!("{index},{index:04}.jpg,{},0,,", index / 3 * 4)
+        })
+        .collect();
+    dataset.write_rows(&rows.iter().map(String::as_str).collect::<Vec<_>>());
+    let recording = dataset.import("held.mcap");
+    let map = dataset.path("held.map");
+    let (code, stdout, stderr) = run(omniloc().arg("train").arg(&recording).arg("--out").arg(&map));
+    assert!(code == 0 && stdout.contains("length 7.00 m"), "{stdout}{stderr}");
+}
+
+#[test]
+fn no_output_may_be_an_input() {
+    let folder = folder();
+    let recording = recording(&folder, 16);
+    let before = fs::read(&recording).expect("readable");
+    let path = recording.to_str().expect("a plain name");
+    for arguments in [
+        vec!["train", path, "--out", path, "--force"],
+        vec!["evaluate", path, "--json", path, "--force"],
+        vec!["evaluate", path, "--json", path],
+        vec!["export", path, "--to", "csv", "--out", path, "--force"],
+        vec!["calibrate", path, "--out", path, "--force"],
+        vec!["train", path, path, "--out", "x.map"],
+        vec!["train", path, "--out", "x.map", "--within-m", "0"],
+        vec!["train", path, "--out", "x.map", "--within-m", "-1"],
+        vec!["evaluate", path, "--json", "/dev/null"],
+        vec!["evaluate", path, "--map", "x.map", "--seeds", "2"],
+    ] {
+        let (code, _, stderr) = run(omniloc().args(&arguments).current_dir(folder.path()));
+        assert_eq!(code, 2, "{arguments:?}: {stderr}");
+    }
+    assert!(fs::read(&recording).expect("readable") == before, "the recording was overwritten");
+    assert!(!folder.path().join("x.map").exists());
+}
+
 #[test]
 fn outputs_that_cannot_be_written_are_refused_before_the_work() {
     let folder = folder();

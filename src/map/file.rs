@@ -267,6 +267,8 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::gp::Hyperparameters;
+    use crate::map::GroupHyperparameters;
     use crate::map::tests::small_map;
 
     #[test]
@@ -301,6 +303,41 @@ mod tests {
         }
         let error = from_bytes(&bytes[..bytes.len() - 5]).expect_err("cut").to_string();
         assert!(error.contains("damaged"), "{error}");
+    }
+
+    /// Maps whose checksum fits but that no training writes.
+    #[test]
+    fn an_impossible_map_is_refused() {
+        type Spoil = fn(&mut FeatureMap);
+        let table: [(&str, Spoil); 12] = [
+            ("no groups", |map| {
+                map.info.groups.clear();
+                map.groups.clear();
+            }),
+            ("no features", |map| map.info.groups[0].features = 0),
+            ("more features than rank", |map| map.info.groups[0].rank = 1),
+            ("the same group twice", |map| {
+                map.info.groups.push(map.info.groups[0].clone());
+                map.groups.push(map.groups[0].clone());
+            }),
+            ("a huge donut", |map| map.info.calibration.outer_radius_px = 1e9),
+            ("a huge image", |map| map.info.image_size_px = [1 << 40, 1 << 40]),
+            ("no weight", |map| map.info.groups[0].recipe.weight = 0.0),
+            ("a tiny step", |map| map.info.grid.step_m = 1e-300),
+            ("a huge grid", |map| map.info.grid.columns = u32::MAX),
+            ("a far grid", |map| map.info.grid.origin_m = [1e300, 0.0]),
+            ("no recordings", |map| map.info.recordings.clear()),
+            ("negative noise", |map| {
+                let bad = Hyperparameters { signal_std: 1.0, noise_std: -1.0, length_scale_m: [1.0; 2] };
+                map.info.groups[0].hyperparameters = GroupHyperparameters::Shared(bad);
+            }),
+        ];
+        for (case, spoil) in table {
+            let mut map = small_map();
+            spoil(&mut map);
+            let error = from_bytes(&to_bytes(&map)).expect_err(case);
+            assert!(matches!(error, MapError::Damaged(_)), "{case}: {error}");
+        }
     }
 
     #[test]

@@ -172,8 +172,8 @@ fn interpolate<P: Copy + Default + Into<f32>>(samples: &[Sample], pixels: &[P], 
     for (samples, values) in samples.chunks(GATHERED).zip(values.chunks_mut(GATHERED)) {
         for ((upper, lower), sample) in upper.iter_mut().zip(&mut lower).zip(samples) {
             let index = sample.index as usize;
-            *upper = [pixels[index], pixels[index + 1]];
-            *lower = [pixels_below[index], pixels_below[index + 1]];
+            upper.copy_from_slice(&pixels[index..index + 2]);
+            lower.copy_from_slice(&pixels_below[index..index + 2]);
         }
         for ((value, sample), (upper, lower)) in values.iter_mut().zip(samples).zip(upper.iter().zip(&lower)) {
             let (right, below) = (f32::from(sample.right) * STEP, f32::from(sample.below) * STEP);

@@ -18,15 +18,21 @@ pub struct LikelihoodTable {
 
 struct Query {
     truth_m: PositionM,
-    /// Block × feature: the values of [`BLOCK`] cells, zeros beyond the last cell. Blocks that could hold the best cell
-    /// are the same for most features, so features lie next to each other.
-    log_likelihood: Vec<[f32; BLOCK]>,
-    /// Feature × block: the smallest value of each block.
-    block_minimum: Vec<f32>,
+    /// Feature × block: the values of [`BLOCK`] cells, zeros beyond the last cell.
+    log_likelihood: Vec<Block>,
+    /// [`LANES`] features × block × feature: the smallest value of each block.
+    block_minimum: Vec<[f32; LANES]>,
 }
 
-/// Cells a block: a cache line, and small against the number of cells.
+/// Values of neighbouring cells: just a cache line.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+struct Block([f32; BLOCK]);
+
+/// Cells a block: small against the number of cells.
 const BLOCK: usize = 16;
+/// Features whose bounds are looked at together.
+const LANES: usize = 8;
 
 impl LikelihoodTable {
     pub fn new(features: usize, centers_m: Vec<PositionM>) -> Self {
@@ -40,16 +46,16 @@ impl LikelihoodTable {
     pub fn push(&mut self, truth_m: PositionM, log_likelihood: &[f32]) {
         let cells = self.centers_m.len();
         assert_eq!(log_likelihood.len(), self.features * cells, "one value a feature and cell");
-        let blocks = cells.div_ceil(BLOCK);
+        let (blocks, rows) = (cells.div_ceil(BLOCK), self.features.div_ceil(LANES));
         let mut query = Query {
             truth_m,
-            log_likelihood: vec![[0.0; BLOCK]; blocks * self.features],
-            block_minimum: Vec::with_capacity(self.features * blocks),
+            log_likelihood: vec![Block([0.0; BLOCK]); blocks * self.features],
+            block_minimum: vec![[0.0; LANES]; blocks * rows],
         };
         for (r, row) in log_likelihood.chunks_exact(cells.max(1)).enumerate() {
             for (block, values) in row.chunks(BLOCK).enumerate() {
-                query.log_likelihood[block * self.features + r][..values.len()].copy_from_slice(values);
-                query.block_minimum.push(least_of(values));
+                query.log_likelihood[r * blocks + block].0[..values.len()].copy_from_slice(values);
+                query.block_minimum[r / LANES * blocks + block][r % LANES] = least_of(values);
             }
         }
         self.queries.push(query);
@@ -114,12 +120,20 @@ pub fn backward_elimination(table: &LikelihoodTable, on_step: impl Fn(usize)) ->
 
     while kept.len() > 1 {
         // Sum over the queries of the squared error without each of the kept features.
-        let squared_errors = table
+        let of_queries: Vec<Vec<f64>> = table
             .queries
             .par_iter()
             .zip(&sums)
-            .map(|(query, sum)| kept.iter().map(|&r| square(query, sum.best_without(query, r))).collect())
-            .reduce(|| vec![0.0; kept.len()], |a: Vec<f64>, b: Vec<f64>| a.iter().zip(b).map(|(a, b)| a + b).collect());
+            .map(|(query, sum)| {
+                let best = sum.best_without_each(query, &kept);
+                kept.iter().map(|&r| square(query, best[r / LANES].cell[r % LANES])).collect()
+            })
+            .collect();
+        // In the order of the queries, so that rounding, and with it ties, is the same on any number of threads.
+        let mut squared_errors = vec![0.0; kept.len()];
+        for of_query in of_queries {
+            squared_errors.iter_mut().zip(of_query).for_each(|(sum, square)| *sum += square);
+        }
         let least = squared_errors.iter().copied().fold(f64::INFINITY, f64::min);
         let position = squared_errors.iter().position(|&error| error <= least).unwrap_or(0);
         let removed = kept.remove(position);
@@ -141,6 +155,12 @@ fn median_rmse_m(table: &LikelihoodTable) -> f64 {
     (sum / truths.len() as f64).sqrt()
 }
 
+impl Query {
+    fn of_feature(&self, r: usize, blocks: usize) -> &[Block] {
+        &self.log_likelihood[r * blocks..(r + 1) * blocks]
+    }
+}
+
 /// S = Σ_r L_r over the kept features, for one query.
 struct RunningSum {
     features: usize,
@@ -153,22 +173,23 @@ struct RunningSum {
 
 impl RunningSum {
     fn over(query: &Query, kept: &[usize], table: &LikelihoodTable) -> Self {
-        let (features, cells) = (table.features, table.centers_m.len());
+        let cells = table.centers_m.len();
         let mut sum = vec![[0.0; BLOCK]; cells.div_ceil(BLOCK)];
         sum.as_flattened_mut()[cells..].fill(f64::NEG_INFINITY);
-        for (sum, values) in sum.iter_mut().zip(query.log_likelihood.chunks_exact(features)) {
-            for &r in kept {
-                sum.iter_mut().zip(&values[r]).for_each(|(sum, &l)| *sum += f64::from(l));
+        for &r in kept {
+            for (sum, values) in sum.iter_mut().zip(query.of_feature(r, cells.div_ceil(BLOCK))) {
+                sum.iter_mut().zip(&values.0).for_each(|(sum, &l)| *sum += f64::from(l));
             }
         }
-        let mut running = Self { features, sum, block_maximum: Vec::new(), best: 0 };
+        let mut running = Self { features: table.features, sum, block_maximum: Vec::new(), best: 0 };
         running.summarise();
         running
     }
 
     fn remove(&mut self, query: &Query, r: usize) {
-        for (sum, values) in self.sum.iter_mut().zip(query.log_likelihood.chunks_exact(self.features)) {
-            sum.iter_mut().zip(&values[r]).for_each(|(sum, &l)| *sum -= f64::from(l));
+        let blocks = self.sum.len();
+        for (sum, values) in self.sum.iter_mut().zip(query.of_feature(r, blocks)) {
+            sum.iter_mut().zip(&values.0).for_each(|(sum, &l)| *sum -= f64::from(l));
         }
         self.summarise();
     }
@@ -182,66 +203,93 @@ impl RunningSum {
         self.best = block * BLOCK + within.unwrap_or(0);
     }
 
-    /// First cell of greatest S − L_r.
-    fn best_without(&self, query: &Query, r: usize) -> usize {
-        let blocks = self.block_maximum.len();
-        let minima = &query.block_minimum[r * blocks..(r + 1) * blocks];
-        let values = Strided { values: &query.log_likelihood[r..], stride: self.features };
-        first_greatest_difference(&self.sum, values, &self.block_maximum, minima, self.best / BLOCK)
+    /// First cell of greatest S − L_r for each of the features `kept`.
+    fn best_without_each(&self, query: &Query, kept: &[usize]) -> Vec<BestCells> {
+        let mut best = vec![BestCells::NONE; self.features.div_ceil(LANES)];
+        let start = self.best / BLOCK;
+        for &r in kept {
+            // The block of the greatest sum first, for a bound that hardly any other block reaches.
+            best[r / LANES].value[r % LANES] = f64::NEG_INFINITY;
+        }
+        let mut candidates: Vec<Candidate> = kept.iter().map(|&r| Candidate::new(start, r)).collect();
+        search(&candidates, self, query, &mut best);
+        candidates.clear();
+        list_candidates(self, query, &best, &mut candidates);
+        search(&candidates, self, query, &mut best);
+        best
     }
 }
 
-/// The blocks of one feature.
+/// A block that could hold the best cell without a feature.
 #[derive(Clone, Copy)]
-struct Strided<'a> {
-    values: &'a [[f32; BLOCK]],
-    stride: usize,
+struct Candidate {
+    block: u32,
+    feature: u32,
 }
 
-/// Blocks whose bounds are looked at together.
-const GROUP: usize = 16;
+impl Candidate {
+    fn new(block: usize, feature: usize) -> Self {
+        Self { block: block as u32, feature: feature as u32 }
+    }
+}
 
-/// The first cell of greatest `sum` − `values`, searched from block `start` on; `maxima` and `minima` are those of the
-/// blocks of `sum` and `values`.
+/// Best cell so far without each of [`LANES`] features, and S − L_r there.
+#[derive(Clone, Copy)]
+struct BestCells {
+    value: [f64; LANES],
+    cell: [usize; LANES],
+}
+
+/// Every block that could beat what is in `best`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
-fn first_greatest_difference(
-    sum: &[[f64; BLOCK]],
-    values: Strided,
-    maxima: &[f64],
-    minima: &[f32],
-    start: usize,
-) -> usize {
-    let mut best = (f64::NEG_INFINITY, start);
-    // Block `start` first, for a bound that hardly any other block reaches.
-    search(start, sum, values, &mut best);
-    for (group, (maxima, minima)) in maxima.chunks(GROUP).zip(minima.chunks(GROUP)).enumerate() {
-        // Without a branch a block.
-        let mut possible = 0_u32;
-        for (i, (maximum, &minimum)) in maxima.iter().zip(minima).enumerate() {
-            possible |= u32::from(maximum - f64::from(minimum) >= best.0) << i;
-        }
-        while possible != 0 {
-            let i = possible.trailing_zeros() as usize;
-            possible &= possible - 1;
-            if maxima[i] - f64::from(minima[i]) >= best.0 {
-                search(group * GROUP + i, sum, values, &mut best);
+fn list_candidates(sum: &RunningSum, query: &Query, best: &[BestCells], candidates: &mut Vec<Candidate>) {
+    let start = sum.best / BLOCK;
+    let rows = query.block_minimum.chunks_exact(sum.block_maximum.len().max(1));
+    for (row, (best, minima)) in best.iter().zip(rows).enumerate() {
+        for (block, (&maximum, minima)) in sum.block_maximum.iter().zip(minima).enumerate() {
+            // Without a branch a feature: most cannot be better in this block.
+            let mut possible = false;
+            for (value, &minimum) in best.value.iter().zip(minima) {
+                possible |= maximum - f64::from(minimum) >= *value;
+            }
+            if possible && block != start {
+                for lane in 0..LANES {
+                    if maximum - f64::from(minima[lane]) >= best.value[lane] {
+                        candidates.push(Candidate::new(block, row * LANES + lane));
+                    }
+                }
             }
         }
     }
-    best.1
 }
 
-/// Improves `best`, a value and its cell, by what block `block` holds.
-#[inline(always)]
-fn search(block: usize, sum: &[[f64; BLOCK]], values: Strided, best: &mut (f64, usize)) {
-    let mut differences = sum[block];
-    for (difference, &l) in differences.iter_mut().zip(&values.values[block * values.stride]) {
-        *difference -= f64::from(l);
+/// Searches the `candidates`. They are listed first and searched then, because nearly all the time goes into fetching
+/// their values from memory, and so several are on their way at once.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
+fn search(candidates: &[Candidate], sum: &RunningSum, query: &Query, best: &mut [BestCells]) {
+    let blocks = sum.sum.len();
+    for candidate in candidates {
+        let (block, feature) = (candidate.block as usize, candidate.feature as usize);
+        let values = &query.log_likelihood[feature * blocks + block];
+        best[feature / LANES].search(feature % LANES, block, &sum.sum[block], values);
     }
-    let greatest = greatest_of(&differences);
-    if greatest > best.0 || (greatest == best.0 && block * BLOCK < best.1) {
-        let first = differences.iter().position(|&difference| difference == greatest).unwrap_or(0);
-        *best = (greatest, block * BLOCK + first);
+}
+
+impl BestCells {
+    /// No cell is better than this: what features that are not kept are left with.
+    const NONE: Self = Self { value: [f64::INFINITY; LANES], cell: [usize::MAX; LANES] };
+
+    /// Improves the best of feature `lane` by what block `block` holds; of equals the first cell.
+    #[inline(always)]
+    fn search(&mut self, lane: usize, block: usize, sum: &[f64; BLOCK], values: &Block) {
+        let mut differences = *sum;
+        differences.iter_mut().zip(&values.0).for_each(|(difference, &l)| *difference -= f64::from(l));
+        let greatest = greatest_of(&differences);
+        let first = block * BLOCK;
+        if greatest > self.value[lane] || (greatest == self.value[lane] && first < self.cell[lane]) {
+            let within = differences.iter().position(|&difference| difference == greatest).unwrap_or(0);
+            (self.value[lane], self.cell[lane]) = (greatest, first + within);
+        }
     }
 }
 
