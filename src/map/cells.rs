@@ -41,7 +41,7 @@ const MAX_STEP_M: f64 = 1e4;
 /// Further from the origin than this is no position on Earth.
 const MAX_COORDINATE_M: f64 = 1e8;
 /// More cells than this are a mistake in the step or the positions.
-const MAX_CELLS: u32 = 4_000_000;
+const MAX_CELLS: u32 = 1_000_000;
 
 impl CandidateCells {
     /// The grid over the bounding box of `positions`; with `within_m`, only cells at most that far from one of them.

@@ -253,8 +253,8 @@ fn list_candidates(sum: &RunningSum, query: &Query, best: &[BestCells], candidat
                 possible |= maximum - f64::from(minimum) >= *value;
             }
             if possible && block != start {
-                for lane in 0..LANES {
-                    if maximum - f64::from(minima[lane]) >= best.value[lane] {
+                for (lane, (value, &minimum)) in best.value.iter().zip(minima).enumerate() {
+                    if maximum - f64::from(minimum) >= *value {
                         candidates.push(Candidate::new(block, row * LANES + lane));
                     }
                 }

@@ -86,7 +86,7 @@ const MIN_LEARNING: usize = 3;
 /// How learning images fall into folds.
 const FOLD_SEED: u64 = 0;
 /// A likelihood table larger than this is refused.
-const MAX_TABLE_BYTES: usize = 4 << 30;
+const MAX_TABLE_BYTES: usize = 2 << 30;
 
 /// What a trial is doing, for a progress display.
 #[derive(Debug, Clone, Copy)]
