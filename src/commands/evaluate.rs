@@ -282,6 +282,10 @@ fn trial_entries(
         n_learned_from: case.split.learning.len(),
         ..Entry::default()
     };
+    // What the fits have to say is said once, not for every seed and variant.
+    let announced = case.variant == Variant::Plain
+        && case.split_name == args.split[0]
+        && case.seed.is_none_or(|seed| seed == args.seed);
     let know_nothing_m = component_median(&pick(&case.split.learning, &recorded_m));
     let mut entries = Vec::new();
     for recipe in recipes {
@@ -295,6 +299,10 @@ fn trial_entries(
         let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &recorded_m };
         let outcomes = run_trial(survey, &trial, |step| progress.step(&part, step)).map_err(bad_argument)?;
         for outcome in &outcomes.rows {
+            for (warning, count) in outcome.warnings.iter().filter(|_| announced) {
+                let (features, of) = (&outcome.features, outcome.rank);
+                progress.say(&format!("note: {part}: {features}: {count} of {of} fits: {}", warning.describe()));
+            }
             let base = Entry { n_learned_from: outcomes.learned_from, ..base.clone() };
             let entry = outcome_entry(base, recipe, outcome, &validation_m, &test_m, know_nothing_m);
             let estimates_m = estimates_of(recipe, outcome);

@@ -1,23 +1,10 @@
 //! What `info`, `check` and `train` say about a map.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde_json::json;
 
-use crate::gp::fit::Warning;
-use crate::map::{FeatureMap, GroupHyperparameters, GroupInfo};
-
-/// Fits of a group by what they have to say.
-pub fn warnings(group: &GroupInfo) -> BTreeMap<Warning, usize> {
-    let mut counts = BTreeMap::new();
-    if let GroupHyperparameters::Each(fits) = &group.hyperparameters {
-        for &warning in fits.iter().flat_map(|fit| &fit.warnings) {
-            *counts.entry(warning).or_default() += 1;
-        }
-    }
-    counts
-}
+use crate::map::{FeatureMap, GroupHyperparameters};
 
 pub fn as_json(path: &Path, map: &FeatureMap, size_bytes: u64) -> serde_json::Value {
     json!({
@@ -85,7 +72,7 @@ pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {
             group.features,
             hyperparameters(&group.hyperparameters)
         );
-        for (warning, count) in warnings(group) {
+        for (warning, count) in group.hyperparameters.warnings() {
             text += &format!("{:<19} {count} of {}: {}\n", "", group.features, warning.describe());
         }
     }

@@ -52,6 +52,11 @@ impl Progress {
         }
     }
 
+    /// Says something beside the bar.
+    pub fn say(&self, text: &str) {
+        self.bar.suspend(|| eprintln!("{text}"));
+    }
+
     /// Clears the bar, so that results can be printed.
     pub fn finish(&self) {
         self.bar.finish_and_clear();

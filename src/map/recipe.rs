@@ -1,11 +1,13 @@
 //! Recipes: which features, scaled how, modelled how, selected how.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 use crate::features::Descriptor;
 use crate::features::scaling::ScalingMethod;
 use crate::gp::Hyperparameters;
-use crate::gp::fit::{Bounds, Fit};
+use crate::gp::fit::{Bounds, Fit, Warning};
 
 /// The recipes the program knows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -175,4 +177,17 @@ pub enum GroupHyperparameters {
     Each(Vec<Fit>),
     /// The same for all features.
     Shared(Hyperparameters),
+}
+
+impl GroupHyperparameters {
+    /// What the fits have to say, each with the number of features it holds for.
+    pub fn warnings(&self) -> BTreeMap<Warning, usize> {
+        let mut counts = BTreeMap::new();
+        if let Self::Each(fits) = self {
+            for &warning in fits.iter().flat_map(|fit| &fit.warnings) {
+                *counts.entry(warning).or_default() += 1;
+            }
+        }
+        counts
+    }
 }

@@ -1,13 +1,11 @@
 //! One descriptor, learned: scaling, Gaussian processes, and their values on the candidate cells.
 
-use std::collections::BTreeMap;
-
 use faer::{Mat, MatRef};
 use rayon::prelude::*;
 
 use super::noise_whitening;
 use crate::features::scaling::{Scaling, ScalingError};
-use crate::gp::fit::{Warning, fit_each};
+use crate::gp::fit::fit_each;
 use crate::gp::{GpError, Hyperparameters, LearningPositions, Posterior};
 use crate::localize::FieldOnCells;
 use crate::map::{GroupHyperparameters, GroupRecipe, Model};
@@ -110,17 +108,6 @@ impl LearnedGroup {
     /// Number of features k.
     pub fn features(&self) -> usize {
         self.scaling.features()
-    }
-
-    /// What the fits have to say, each with the number of features it holds for.
-    pub fn warnings(&self) -> Vec<(Warning, usize)> {
-        let mut counts = BTreeMap::new();
-        if let GroupHyperparameters::Each(fits) = &self.hyperparameters {
-            for &warning in fits.iter().flat_map(|fit| &fit.warnings) {
-                *counts.entry(warning).or_insert(0) += 1;
-            }
-        }
-        counts.into_iter().collect()
     }
 
     /// Summed log marginal likelihood of the features `kept`; `None` where features are not fitted one by one.

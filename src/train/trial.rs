@@ -1,5 +1,7 @@
 //! The paper's protocol on one survey: learn, select, test.
 
+use std::collections::BTreeMap;
+
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -9,6 +11,7 @@ use super::group::{LearnError, LearnedGroup};
 use super::split::Split;
 use super::subset::{LikelihoodTable, backward_elimination};
 use super::survey::Survey;
+use crate::gp::fit::Warning;
 use crate::gp::{GpError, LearningPositions};
 use crate::localize::{FieldOnCells, most_likely_cell, refined_m};
 use crate::map::{CandidateCells, CellsError, NoiseModel, Recipe, Selection};
@@ -55,7 +58,7 @@ pub struct Outcome {
     pub bic_all: Option<f64>,
     pub bic_kept: Option<f64>,
     /// Fits with something to say, by what they say.
-    pub warnings: Vec<(crate::gp::fit::Warning, usize)>,
+    pub warnings: BTreeMap<Warning, usize>,
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -176,7 +179,7 @@ fn run_once(
             Selection::Backward => queries.select(&group, &field, &centers_m, on_step)?,
         };
         let kept_group = group.select(&kept);
-        let kept_field = kept_group.on_cells(&learning, &centers_m)?;
+        let kept_field = field.select(&kept);
         let all_test = queries.likelihoods(&group, &field, &split.test);
         let kept_test = queries.likelihoods(&kept_group, &kept_field, &split.test);
         let kept_validation = queries.likelihoods(&kept_group, &kept_field, &split.validation);
@@ -192,7 +195,7 @@ fn run_once(
             kept_validation_m: estimate(&kept_validation, kept.len()),
             bic_all: bic(&everything),
             bic_kept: bic(&kept),
-            warnings: group.warnings(),
+            warnings: group.hyperparameters.warnings(),
         });
         let weight = group_recipe.weight as f32;
         match &mut fused {
@@ -219,7 +222,7 @@ fn run_once(
             kept_validation_m: estimate(&kept_validation, total(|outcome| outcome.kept)),
             bic_all: sum(|outcome| outcome.bic_all),
             bic_kept: sum(|outcome| outcome.bic_kept),
-            warnings: Vec::new(),
+            warnings: BTreeMap::new(),
         });
     }
     Ok(Outcomes { rows: outcomes, groups, learned_from: learning.len() })
