@@ -1,7 +1,6 @@
 //! `omniloc calibrate`: finds the donut, writes `donut.json` and a picture to judge it by.
 
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
@@ -10,7 +9,7 @@ use serde_json::json;
 use super::options::{OutputKind, check_not_input, check_output};
 use super::{BadArgument, frame_source, print};
 use crate::calibrate::{DonutEstimate, DonutFinder, FindDonutError, Orientation, Verdict, overlay};
-use crate::recording::{RecordingError, write_file_atomically};
+use crate::recording::write_bytes_atomically;
 use crate::types::{AzimuthSense, DonutCalibration, LumaImage};
 
 /// Find the donut in camera images: centre and radii
@@ -101,8 +100,8 @@ pub fn run(args: &CalibrateArgs) -> anyhow::Result<ExitCode> {
         let mut text = serde_json::to_string_pretty(&outcome.calibration).context("encoding the calibration")?;
         text.push('\n');
         // The calibration last: where it is, the picture is too.
-        write_whole(&args.overlay, png.get_ref())?;
-        write_whole(&args.out, text.as_bytes())?;
+        write_bytes_atomically(&args.overlay, png.get_ref())?;
+        write_bytes_atomically(&args.out, text.as_bytes())?;
         outcome.written = vec![args.out.clone(), args.overlay.clone()];
     }
     let report = if args.json { format!("{:#}\n", json_report(&outcome)) } else { text_report(&outcome, accepted) };
@@ -159,12 +158,6 @@ fn cut_rim_px(donut: &DonutCalibration, frame: &LumaImage) -> Option<f64> {
         (donut.outer_radius_px - center).max(center + donut.outer_radius_px - (size as f64 - 1.0))
     };
     Some(beyond(donut.center_x_px, frame.width_px).max(beyond(donut.center_y_px, frame.height_px)))
-}
-
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), RecordingError> {
-    write_file_atomically(path, |out| {
-        out.write_all(bytes).map_err(|cause| RecordingError::CannotWrite { path: path.into(), cause })
-    })
 }
 
 /// Distance of the centres and change of the radii \[px\].

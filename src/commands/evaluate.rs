@@ -1,6 +1,5 @@
 //! `omniloc evaluate`: the paper's tables, and more, on one's own data.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -17,7 +16,7 @@ use crate::evaluate::{Entry, LEGEND, against_map, table};
 use crate::features::Descriptor;
 use crate::map::{FeatureMap, Recipe, RecipeName, Selection, SplitKind, file};
 use crate::metrics::{ErrorFigures, component_median};
-use crate::recording::{Recording, RecordingError, write_file_atomically};
+use crate::recording::{Recording, write_bytes_atomically};
 use crate::train::{Outcome, Split, Survey, Trial, noisy, run as run_trial};
 use crate::types::PositionM;
 
@@ -377,10 +376,6 @@ fn write_json(path: &Path, args: &Args, entries: &[Entry]) -> anyhow::Result<()>
         "datasets": datasets,
         "results": entries,
     });
-    write_file_atomically(path, |out| {
-        let cannot = |cause| RecordingError::CannotWrite { path: path.into(), cause };
-        serde_json::to_writer_pretty(&mut *out, &object).map_err(|error| cannot(error.into()))?;
-        out.write_all(b"\n").map_err(cannot)
-    })?;
+    write_bytes_atomically(path, format!("{object:#}\n").as_bytes())?;
     Ok(())
 }

@@ -1,6 +1,5 @@
 //! `omniloc train`: recordings become a map.
 
-use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -11,7 +10,7 @@ use super::survey::{bad_argument, default_grid_step_m, open_recordings, parse_de
 use super::{DONE, print};
 use crate::features::Descriptor;
 use crate::map::{Recipe, RecipeName, Selection, SplitKind, file};
-use crate::recording::{RecordingError, write_file_atomically};
+use crate::recording::write_bytes_atomically;
 use crate::train::{TrainSettings, train};
 
 /// Turn recordings of a place into a map
@@ -76,9 +75,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let map =
         train(&survey, &sources, &recipe, &settings, |step| progress.step("training", step)).map_err(bad_argument)?;
     let bytes = file::to_bytes(&map);
-    write_file_atomically(&args.out, |out| {
-        out.write_all(&bytes).map_err(|cause| RecordingError::CannotWrite { path: args.out.clone(), cause })
-    })?;
+    write_bytes_atomically(&args.out, &bytes)?;
     progress.finish();
     if let Some(figures) = map.info.validation.last().filter(|figures| figures.skill < MIN_SKILL) {
         eprintln!(

@@ -23,4 +23,4 @@ pub use export::{ExportError, ExportReport, Format, export};
 pub use import::{CalibrationSource, ImportReport, ImportSettings, import};
 pub use reader::{Frames, Recording, SurveyFrame, TopicSummary};
 pub use verify::{Verdict, verify};
-pub use writer::{RecordingWriter, write_file_atomically};
+pub use writer::{RecordingWriter, write_bytes_atomically, write_file_atomically};

@@ -150,6 +150,13 @@ pub fn write_file_atomically<E: From<RecordingError>>(
     Ok(())
 }
 
+/// [`write_file_atomically`] of bytes that are there already.
+pub fn write_bytes_atomically(path: &Path, bytes: &[u8]) -> Result<(), RecordingError> {
+    write_file_atomically(path, |out| {
+        out.write_all(bytes).map_err(|cause| RecordingError::CannotWrite { path: path.into(), cause })
+    })
+}
+
 /// The folder that holds `path`.
 pub(super) fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))

@@ -34,7 +34,7 @@ pub fn perturbed(panorama: &Panorama, seed: u64, stream: u64) -> Panorama {
     relight(&mut wide, &mut random);
     occlude(&mut wide, &mut random);
     for value in &mut wide {
-        *value = (*value + PIXEL_NOISE_STD * normal(&mut random)).clamp(0.0, 255.0);
+        *value = (*value + PIXEL_NOISE_STD * standard_normal(&mut random)).clamp(0.0, 255.0);
     }
     Panorama::from_wide(wide)
 }
@@ -58,11 +58,11 @@ fn tilted(wide: &[f32], random: &mut ChaCha8Rng) -> Vec<f32> {
 
 /// Another tone curve, exposure and distribution of light, and hard-edged shadows or patches of sun.
 fn relight(wide: &mut [f32], random: &mut ChaCha8Rng) {
-    let gamma = (LOG_GAMMA_STD * normal(random)).exp();
-    let exposure = LOG_EXPOSURE_STD * normal(random);
-    let (side, side_at) = (LOG_SIDE_LIGHT_STD * normal(random), random.random_range(0.0..TAU));
-    let (second, second_at) = (LOG_SECOND_HARMONIC_STD * normal(random), random.random_range(0.0..TAU));
-    let vertical = LOG_VERTICAL_STD * normal(random);
+    let gamma = (LOG_GAMMA_STD * standard_normal(random)).exp();
+    let exposure = LOG_EXPOSURE_STD * standard_normal(random);
+    let (side, side_at) = (LOG_SIDE_LIGHT_STD * standard_normal(random), random.random_range(0.0..TAU));
+    let (second, second_at) = (LOG_SECOND_HARMONIC_STD * standard_normal(random), random.random_range(0.0..TAU));
+    let vertical = LOG_VERTICAL_STD * standard_normal(random);
     let of_column: Vec<f32> = (0..WIDE_COLUMNS)
         .map(|column| {
             let azimuth = azimuth(column);
@@ -120,7 +120,7 @@ fn azimuth(column: usize) -> f32 {
 }
 
 /// A standard normal number (Box & Muller 1958).
-fn normal(random: &mut ChaCha8Rng) -> f32 {
+pub(super) fn standard_normal(random: &mut ChaCha8Rng) -> f32 {
     let radius = (-2.0 * (1.0 - random.random::<f32>()).ln()).sqrt();
     radius * (TAU * random.random::<f32>()).cos()
 }
@@ -151,7 +151,7 @@ mod tests {
     #[test]
     fn normal_numbers_have_mean_zero_and_unit_variance() {
         let mut random = ChaCha8Rng::seed_from_u64(5);
-        let values: Vec<f32> = (0..20_000).map(|_| normal(&mut random)).collect();
+        let values: Vec<f32> = (0..20_000).map(|_| standard_normal(&mut random)).collect();
         let mean = values.iter().sum::<f32>() / 20_000.0;
         let variance = values.iter().map(|v| v * v).sum::<f32>() / 20_000.0;
         assert!(mean.abs() < 0.03 && (variance - 1.0).abs() < 0.05, "{mean} {variance}");

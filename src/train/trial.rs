@@ -8,6 +8,7 @@ use rayon::prelude::*;
 
 use super::folded::folded_selection;
 use super::group::{LearnError, LearnedGroup};
+use super::perturbation::standard_normal;
 use super::split::Split;
 use super::subset::{LikelihoodTable, backward_elimination};
 use super::survey::Survey;
@@ -317,12 +318,8 @@ pub const NOISY_POSITION_STD_M: f64 = 0.3048;
 
 /// `positions_m` with seeded Gaussian noise of [`NOISY_POSITION_STD_M`].
 pub fn noisy(positions_m: &[PositionM], seed: u64) -> Vec<PositionM> {
-    use rand::Rng;
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(1);
-    let mut normal = || {
-        let radius = (-2.0 * (1.0 - random.random::<f64>()).ln()).sqrt();
-        NOISY_POSITION_STD_M * radius * (std::f64::consts::TAU * random.random::<f64>()).cos()
-    };
+    let mut normal = || NOISY_POSITION_STD_M * f64::from(standard_normal(&mut random));
     positions_m.iter().map(|p| [p[0] + normal(), p[1] + normal()]).collect()
 }
