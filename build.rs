@@ -7,11 +7,15 @@ use prost::Message;
 use protox::Compiler;
 
 /// Messages that are written to a topic; what they import comes along.
-const TOPIC_MESSAGES: [&str; 5] = [
+const TOPIC_MESSAGES: [&str; 9] = [
     "foxglove/CompressedImage",
     "foxglove/LocationFix",
     "foxglove/PoseInFrame",
+    "omniloc/ClockOffset",
+    "omniloc/Dropped",
     "omniloc/Heading",
+    "omniloc/SerialChunk",
+    "omniloc/Status",
     "omniloc/SurveyPair",
 ];
 

@@ -16,6 +16,7 @@
 //! | module | what it is for |
 //! |---|---|
 //! | [`types`] | words every folder may use: positions, calibration, images |
+//! | [`devices`] | hardware in, stamped values out |
 //! | [`recording`] | MCAP on disk; import and export of image folders |
 //! | [`jpeg`] | JPEG in, luma out |
 //! | [`calibrate`] | finds the donut in the image |
@@ -38,6 +39,7 @@
 
 pub mod calibrate;
 pub mod commands;
+pub mod devices;
 pub mod evaluate;
 pub mod features;
 #[cfg(test)]

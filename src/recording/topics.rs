@@ -3,10 +3,14 @@
 //! | topic | schema | content |
 //! |---|---|---|
 //! | `/camera/image` | foxglove.CompressedImage | the JPEG; the MCAP sequence number is the frame's number |
+//! | `/gnss/raw` | omniloc.SerialChunk | bytes as received |
 //! | `/gnss/fix` | foxglove.LocationFix | position on WGS84, only if the origin is known |
 //! | `/gnss/heading` | omniloc.Heading | yaw and where it came from |
 //! | `/survey/pair` | omniloc.SurveyPair | where the vehicle was when a frame was exposed |
 //! | `/survey/pose` | foxglove.PoseInFrame | the same in the frame `map`, for viewers |
+//! | `/clock` | omniloc.ClockOffset | monotonic clock, realtime and UTC of the receiver side by side |
+//! | `/status` | omniloc.Status | rates, lag, disk, temperature: once a second |
+//! | `/dropped` | omniloc.Dropped | every loss: what, how much, why |
 
 /// A topic and the schema of its messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,10 +32,14 @@ macro_rules! topic {
 }
 
 pub const CAMERA_IMAGE: Topic = topic!("/camera/image", "foxglove.CompressedImage");
+pub const GNSS_RAW: Topic = topic!("/gnss/raw", "omniloc.SerialChunk");
 pub const GNSS_FIX: Topic = topic!("/gnss/fix", "foxglove.LocationFix");
 pub const GNSS_HEADING: Topic = topic!("/gnss/heading", "omniloc.Heading");
 pub const SURVEY_PAIR: Topic = topic!("/survey/pair", "omniloc.SurveyPair");
 pub const SURVEY_POSE: Topic = topic!("/survey/pose", "foxglove.PoseInFrame");
+pub const CLOCK: Topic = topic!("/clock", "omniloc.ClockOffset");
+pub const STATUS: Topic = topic!("/status", "omniloc.Status");
+pub const DROPPED: Topic = topic!("/dropped", "omniloc.Dropped");
 
 /// The ENU frame of all positions.
 pub const MAP_FRAME: &str = "map";
