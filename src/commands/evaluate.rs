@@ -9,7 +9,8 @@ use serde_json::json;
 use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
 use super::survey::{
-    bad_argument, default_grid_step_m, open_recordings, parse_descriptor, read_to_learn, read_to_match, read_truth,
+    bad_argument, default_grid_step_m, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
+    read_to_match, read_truth,
 };
 use super::{BadArgument, DONE, print};
 use crate::evaluate::{Entry, LEGEND, against_map, table};
@@ -51,6 +52,9 @@ pub struct Args {
     /// separated by commas [default: random,blocked]
     #[arg(long, value_delimiter = ',', default_values = ["random", "blocked"], hide_default_value = true)]
     pub split: Vec<String>,
+    /// Leave out frames that are closer than this to the one before [m; default: as many as make 800 frames]
+    #[arg(long, value_name = "M", value_parser = parse_spacing_m)]
+    pub spacing_m: Option<f64>,
     /// First seed of the splits
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -125,7 +129,9 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
             );
         }
     }
-    let recordings = open_recordings(&args.recordings)?;
+    // Against a map every frame counts: only learning is costly.
+    let spacing_m = args.spacing_m.or(args.map.as_ref().map(|_| 0.0));
+    let recordings = open_recordings(&args.recordings, spacing_m)?;
     let progress = Progress::new();
     let mut all = Vec::new();
     for (number, recording) in recordings.iter().enumerate() {
@@ -148,7 +154,18 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
         eprintln!("warning: the map was trained on {}: it knows these frames, and the errors flatter", recording.name);
     }
     let descriptors = map.info.groups.iter().map(|group| group.recipe.descriptor).collect();
-    let survey = read_to_match(recording, descriptors, progress)?;
+    let mut recording = recording.clone();
+    if let Some(origin) = map.info.origin
+        && !recording.move_origin(origin)
+    {
+        anyhow::bail!(
+            "{}: does not know where on the Earth it lies, but {} does: positions cannot be compared; import it with \
+             --origin",
+            recording.path.display(),
+            path.display()
+        );
+    }
+    let survey = read_to_match(&recording, descriptors, progress)?;
     map.info
         .check_lens(&survey.calibration, survey.image_size_px)
         .with_context(|| format!("{} against {}", recording.path.display(), path.display()))?;

@@ -82,12 +82,6 @@ fn extent_m(recording: &Recording) -> Option<[[f64; 2]; 2]> {
     Some([range(0)?, range(1)?])
 }
 
-/// Way from frame to frame \[m\].
-fn length_m(recording: &Recording) -> f64 {
-    let pairs = recording.survey.windows(2);
-    pairs.map(|pair| crate::types::distance_m(pair[0].position_m, pair[1].position_m)).sum()
-}
-
 fn with_yaw(recording: &Recording) -> usize {
     recording.survey.iter().filter(|frame| frame.yaw_rad.is_some()).count()
 }
@@ -119,7 +113,7 @@ fn as_json(recording: &Recording, size_bytes: u64) -> serde_json::Value {
         "images_without_pair": recording.images_without_pair,
         "east_range_m": extent.map(|[east, _]| east),
         "north_range_m": extent.map(|[_, north]| north),
-        "length_m": length_m(recording),
+        "length_m": recording.length_m(),
         "origin": recording.origin.map(|origin| json!({
             "latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg, "altitude_m": origin.altitude_m,
         })),
@@ -146,7 +140,7 @@ fn as_text(recording: &Recording, size_bytes: u64) -> String {
     }
     if let Some([east, north]) = extent_m(recording) {
         let (width_m, height_m) = (east[1] - east[0], north[1] - north[0]);
-        line("extent", format!("{width_m:.1} x {height_m:.1} m, way {:.1} m", length_m(recording)));
+        line("extent", format!("{width_m:.1} x {height_m:.1} m, way {:.1} m", recording.length_m()));
         line("east", format!("{:.2} .. {:.2} m", east[0], east[1]));
         line("north", format!("{:.2} .. {:.2} m", north[0], north[1]));
     }

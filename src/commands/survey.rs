@@ -13,8 +13,34 @@ use crate::recording::Recording;
 use crate::train::{Survey, SurveyOptions, TrialError};
 use crate::types::PositionM;
 
-/// Opens `paths`, all of which must be usable.
-pub fn open_recordings(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
+/// Learning takes time with the third power of the number of frames: more than this many are thinned out.
+const MAX_FRAMES: usize = 800;
+
+/// Opens `paths`, all of which must be usable, and counts their positions from the origin of the first.
+///
+/// Of frames closer than `spacing_m` to the one before, only the first is kept. Without it, a drive of more than
+/// [`MAX_FRAMES`] frames is thinned to about that many.
+pub fn open_recordings(paths: &[PathBuf], spacing_m: Option<f64>) -> anyhow::Result<Vec<Recording>> {
+    let mut recordings = open_all(paths)?;
+    if let Some(origin) = recordings.first().and_then(|first| first.origin) {
+        // One that does not know its own origin is refused where they are put together.
+        recordings.iter_mut().for_each(|recording| _ = recording.move_origin(origin));
+    }
+    let frames = recordings.iter().map(|recording| recording.survey.len()).sum::<usize>();
+    let spacing_m = match spacing_m {
+        Some(spacing_m) => spacing_m,
+        None if frames <= MAX_FRAMES => return Ok(recordings),
+        None => {
+            let spacing_m = recordings.iter().map(Recording::length_m).sum::<f64>() / MAX_FRAMES as f64;
+            eprintln!("note: {frames} frames are thinned to one every {spacing_m:.2} m; --spacing-m chooses otherwise");
+            spacing_m
+        }
+    };
+    recordings.iter_mut().for_each(|recording| recording.keep_spaced(spacing_m));
+    Ok(recordings)
+}
+
+fn open_all(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
     for (i, path) in paths.iter().enumerate() {
         check_not_input(path, &paths[..i]).map_err(|_| BadArgument(format!("{} is named twice", path.display())))?;
     }
@@ -81,6 +107,12 @@ pub fn default_grid_step_m(positions_m: &[PositionM]) -> f64 {
     const ROOM_M: f64 = 20.0;
     let extent_m = crate::gp::fit::extent_m(positions_m);
     if extent_m[0].hypot(extent_m[1]) < ROOM_M { 0.1 } else { 1.0 }
+}
+
+/// A distance, as an argument.
+pub fn parse_spacing_m(text: &str) -> Result<f64, String> {
+    let spacing_m = text.parse().ok().filter(|spacing_m| (0.0..=1000.0).contains(spacing_m));
+    spacing_m.ok_or_else(|| "expected metres from 0 to 1000".into())
 }
 
 /// A feature type, as an argument.

@@ -6,7 +6,9 @@ use std::process::ExitCode;
 use super::map_report;
 use super::options::{OutputKind, check_not_input, check_output};
 use super::progress::Progress;
-use super::survey::{bad_argument, default_grid_step_m, open_recordings, parse_descriptor, read_to_learn};
+use super::survey::{
+    bad_argument, default_grid_step_m, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
+};
 use super::{DONE, print};
 use crate::features::Descriptor;
 use crate::map::{Recipe, RecipeName, Selection, SplitKind, file};
@@ -46,6 +48,9 @@ pub struct Args {
     /// Candidate cells are at most this far from a learning position [m; default: 7 times the positions' spacing]
     #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub within_m: Option<f64>,
+    /// Leave out frames that are closer than this to the one before [m; default: as many as make 800 frames]
+    #[arg(long, value_name = "M", value_parser = parse_spacing_m)]
+    pub spacing_m: Option<f64>,
     /// Replace the output if it exists
     #[arg(long)]
     pub force: bool,
@@ -62,7 +67,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Some(selection) => recipe.with_selection(selection),
         None => recipe,
     };
-    let recordings = open_recordings(&args.recordings)?;
+    let recordings = open_recordings(&args.recordings, args.spacing_m)?;
     let progress = Progress::new();
     let survey = read_to_learn(&recordings, std::slice::from_ref(&recipe), false, &progress)?;
     let settings = TrainSettings {

@@ -6,6 +6,7 @@
 
 mod dataset;
 mod error;
+mod events;
 mod export;
 mod import;
 mod positions;
@@ -19,6 +20,7 @@ mod writer;
 
 pub use dataset::{Dataset, DatasetError};
 pub use error::RecordingError;
+pub use events::{DeviceRecord, DeviceRecords, TimedRecord};
 pub use export::{ExportError, ExportReport, Format, export};
 pub use import::{CalibrationSource, ImportReport, ImportSettings, import};
 pub use reader::{Frames, Recording, SurveyFrame, TopicSummary};

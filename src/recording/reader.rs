@@ -15,7 +15,7 @@ use super::{
     scan::{Scan, parse_calibration},
     topics,
 };
-use crate::types::{DonutCalibration, Geodetic, PositionM};
+use crate::types::{DonutCalibration, Geodetic, LocalFrame, PositionM, distance_m};
 
 /// What is known of the place one frame was taken at.
 #[derive(Debug, Clone, PartialEq)]
@@ -51,7 +51,7 @@ pub struct TopicSummary {
 }
 
 /// An opened recording: everything but the images, which [`frames`](Self::frames) reads from the file.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Recording {
     pub path: PathBuf,
     /// Name of the data set or drive; the file's name if the recording states none.
@@ -112,6 +112,37 @@ impl Recording {
     pub fn calibration(&self) -> Result<DonutCalibration, RecordingError> {
         let missing = || RecordingError::NoCalibration { path: self.path.clone() };
         parse_calibration(&self.path, self.calibration_json.as_ref().ok_or_else(missing)?, self.image_size_px)
+    }
+
+    /// Way from usable frame to usable frame \[m\].
+    pub fn length_m(&self) -> f64 {
+        self.survey.windows(2).map(|pair| distance_m(pair[0].position_m, pair[1].position_m)).sum()
+    }
+
+    /// Counts positions from another origin. `false`, and nothing is changed, if this recording's own is not known.
+    pub fn move_origin(&mut self, to: Geodetic) -> bool {
+        let Some(from) = self.origin else { return false };
+        if from != to {
+            let (from, target) = (LocalFrame::new(from), LocalFrame::new(to));
+            for frame in &mut self.survey {
+                let [east_m, north_m, _] = target.to_enu_m(from.plane_to_geodetic(frame.position_m));
+                frame.position_m = [east_m, north_m];
+            }
+            self.origin = Some(to);
+        }
+        true
+    }
+
+    /// Keeps the first frame, and then each one that is at least this far from the last kept one.
+    pub fn keep_spaced(&mut self, spacing_m: f64) {
+        let mut last_m: Option<PositionM> = None;
+        self.survey.retain(|frame| {
+            let keep = last_m.is_none_or(|last_m| distance_m(last_m, frame.position_m) >= spacing_m);
+            if keep {
+                last_m = Some(frame.position_m);
+            }
+            keep
+        });
     }
 
     /// The usable frames with their images, in the order of [`survey`](Self::survey); reads the file again.
@@ -301,6 +332,27 @@ mod tests {
         };
         Recording::for_each_image(&path, every_image).expect("sound");
         assert_eq!(images, [(1, 1), (2, 2), (3, 3)], "stops when told to");
+    }
+
+    #[test]
+    fn spacing_counts_from_the_last_frame_kept_and_origins_can_be_moved() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("drive.mcap");
+        write_drive(&path, Some(DONUT), &[(1, 10.0, true), (2, 10.6, true), (3, 11.2, true), (4, 11.9, true)]);
+        let mut recording = Recording::open(&path).expect("sound");
+        let old = Geodetic { latitude_deg: 48.0, longitude_deg: 11.0, altitude_m: 500.0 };
+        let new = Geodetic { longitude_deg: 11.001, ..old };
+        assert!(!recording.move_origin(new), "it does not know its own");
+        recording.origin = Some(old);
+        assert!(recording.move_origin(new));
+        // A thousandth of a degree at 48 degrees north: a cos φ / sqrt(1 - e² sin² φ) plus the altitude.
+        let [east_m, north_m] = recording.survey[0].position_m;
+        assert!((east_m - (10.0 - 74.634)).abs() < 0.01 && north_m.abs() < 0.001, "{east_m} {north_m}");
+
+        recording.keep_spaced(1.0);
+        assert_eq!(recording.survey.iter().map(|frame| frame.index).collect::<Vec<_>>(), [1, 3]);
+        let frames: Vec<_> = recording.frames().expect("opens").collect::<Result<_, _>>().expect("sound");
+        assert_eq!(frames.iter().map(|(frame, _)| frame.index).collect::<Vec<_>>(), [1, 3]);
     }
 
     #[test]

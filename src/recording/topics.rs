@@ -6,6 +6,7 @@
 //! | `/gnss/raw` | omniloc.SerialChunk | bytes as received |
 //! | `/gnss/fix` | foxglove.LocationFix | position on WGS84, only if the origin is known |
 //! | `/gnss/heading` | omniloc.Heading | yaw and where it came from |
+//! | `/gnss/pulse` | omniloc.Pulse | edges of the receiver's pulse a second |
 //! | `/survey/pair` | omniloc.SurveyPair | where the vehicle was when a frame was exposed |
 //! | `/survey/pose` | foxglove.PoseInFrame | the same in the frame `map`, for viewers |
 //! | `/clock` | omniloc.ClockOffset | monotonic clock, realtime and UTC of the receiver side by side |
@@ -35,6 +36,7 @@ pub const CAMERA_IMAGE: Topic = topic!("/camera/image", "foxglove.CompressedImag
 pub const GNSS_RAW: Topic = topic!("/gnss/raw", "omniloc.SerialChunk");
 pub const GNSS_FIX: Topic = topic!("/gnss/fix", "foxglove.LocationFix");
 pub const GNSS_HEADING: Topic = topic!("/gnss/heading", "omniloc.Heading");
+pub const GNSS_PULSE: Topic = topic!("/gnss/pulse", "omniloc.Pulse");
 pub const SURVEY_PAIR: Topic = topic!("/survey/pair", "omniloc.SurveyPair");
 pub const SURVEY_POSE: Topic = topic!("/survey/pose", "foxglove.PoseInFrame");
 pub const CLOCK: Topic = topic!("/clock", "omniloc.ClockOffset");

@@ -72,7 +72,7 @@ pub enum SurveyError {
          a map is of one lens: calibrate both alike or train two maps"
     )]
     MixedCalibrations { first: String, other: String, expected: String, found: String },
-    #[error("{first} and {other} have different origins: their positions cannot be put into one map")]
+    #[error("only one of {first} and {other} knows where on the Earth it lies: they cannot be put into one map")]
     MixedOrigins { first: String, other: String },
     #[error("{recording}: frame {index} has no yaw, which turning the panorama needs")]
     NoYaw { recording: String, index: usize },
