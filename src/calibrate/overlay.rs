@@ -45,7 +45,7 @@ pub fn overlay(frame: &LumaImage, donut: &DonutEstimate, orientation: &Orientati
 
 fn legend(donut: &DonutEstimate) -> Vec<(String, [u8; 3])> {
     let verdict = match &donut.verdict {
-        Verdict::Sure => (format!("sure, confidence {:.2}, {} frames", donut.confidence, donut.frames_used), START),
+        Verdict::Sure => (format!("sure, confidence {:.2}, {} frames", donut.confidence, donut.frames_used), TEXT),
         Verdict::Doubtful(_) => {
             (format!("DOUBTFUL, confidence {:.2}, {} frames", donut.confidence, donut.frames_used), DOUBT)
         }
@@ -63,6 +63,7 @@ fn legend(donut: &DonutEstimate) -> Vec<(String, [u8; 3])> {
             ),
             TEXT,
         ),
+        ("column 0 of the panorama".into(), START),
         verdict,
     ]
 }

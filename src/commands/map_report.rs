@@ -4,6 +4,7 @@ use std::path::Path;
 
 use serde_json::json;
 
+use super::printable;
 use crate::map::{FeatureMap, GroupHyperparameters};
 
 pub fn as_json(path: &Path, map: &FeatureMap, size_bytes: u64) -> serde_json::Value {
@@ -59,7 +60,7 @@ pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {
             None => "unknown: positions are local metres".into(),
         },
     ));
-    let mut text: String = lines.iter().map(|(label, text)| format!("{label:<15}{text}\n")).collect();
+    let mut text: String = lines.iter().map(|(label, text)| format!("{label:<15}{}\n", printable(text))).collect();
 
     text += &format!("\n{:<19} {:>5} {:>5} {:>5}  hyperparameters\n", "features", "m", "rank", "kept");
     for group in &info.groups {

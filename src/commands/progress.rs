@@ -21,7 +21,7 @@ impl Progress {
         let on_terminal = std::io::stderr().is_terminal();
         let target = if on_terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
         let bar = ProgressBar::with_draw_target(None, target);
-        let style = ProgressStyle::with_template("{elapsed:>4} {msg:44} {wide_bar} {pos}/{len}");
+        let style = ProgressStyle::with_template("{elapsed:>4} {msg:44} {wide_bar} {percent:>3} %, {eta} left");
         bar.set_style(style.expect("the template is sound"));
         Self { bar, stage: Mutex::new(String::new()), on_terminal, start: Instant::now() }
     }

@@ -127,7 +127,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<FeatureMap, MapError> {
     match json["format_version"].as_u64() {
         Some(found) if found != u64::from(FORMAT_VERSION) => return Err(MapError::UnsupportedVersion { found }),
         Some(_) => {}
-        None => return Err(not_a_map(&"it states no format version")),
+        None => return Err(not_a_map(&"its format_version is not a whole number")),
     }
     let file = SafeTensors::deserialize(bytes).map_err(|error| MapError::Damaged(error.to_string()))?;
     let mut tensors: BTreeMap<String, TensorView> = file.tensors().into_iter().collect();

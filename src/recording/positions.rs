@@ -67,7 +67,7 @@ pub(super) fn read_rows(path: &Path, source: impl Read) -> Result<Vec<Row>, Data
 }
 
 fn check_header(path: &Path, header: &csv::StringRecord) -> Result<(), DatasetError> {
-    let found: Vec<&str> = header.iter().collect();
+    let found: Vec<&str> = header.iter().map(str::trim).collect();
     if found == HEADER {
         return Ok(());
     }

@@ -14,4 +14,4 @@ pub use geometry::{PositionM, distance_m, wrap_angle_rad};
 pub use gnss::{Fix, FixQuality, GnssSample, Heading, North, SampleTime, TimeScale};
 pub use image::LumaImage;
 pub use pool::{BufferPool, PooledBytes};
-pub use time::{Clock, ClockReading, ManualClock, NS_PER_S, SystemClock};
+pub use time::{Clock, ClockReading, ManualClock, NS_PER_S, ScaledClock, SystemClock};
