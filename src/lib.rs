@@ -42,6 +42,7 @@ pub mod commands;
 pub mod devices;
 pub mod evaluate;
 pub mod features;
+pub mod gnss;
 #[cfg(test)]
 mod golden;
 pub mod gp;
