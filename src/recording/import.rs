@@ -76,7 +76,7 @@ pub fn import(settings: &ImportSettings, out: &Path) -> Result<ImportReport, Dat
             let complete = jpeg::with_huffman_tables(&bytes).map_err(|source| bad_image(&dataset, row, source))?;
             completed_frames += usize::from(!info.has_huffman_tables);
             let stamp_ns = stamp_ns(row, count);
-            recording.write_image(row.index, stamp_ns, complete.into_owned()).map_err(failed)?;
+            recording.write_image(row.index, stamp_ns, &complete).map_err(failed)?;
             write_position(&mut recording, row, stamp_ns, local_frame.as_ref()).map_err(failed)?;
         }
         recording.finish().map_err(failed)?;

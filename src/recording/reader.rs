@@ -298,7 +298,7 @@ mod tests {
             recording.attach("donut.json", "application/json", 0, json.as_bytes()).expect("attaches");
         }
         for frame in 1..=4 {
-            recording.write_image(frame, frame.into(), picture(frame as u8)).expect("writes");
+            recording.write_image(frame, frame.into(), &picture(frame as u8)).expect("writes");
             recording.flush().expect("flushes");
         }
         for &(frame, east_m, valid) in pairs {

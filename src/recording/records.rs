@@ -20,16 +20,16 @@ use mcap::{
 use super::error::RecordingError;
 
 /// No record of ours comes near; a forged length must not make us take all memory.
-const MAX_RECORD_BYTES: u64 = 192 << 20;
+pub(super) const MAX_RECORD_BYTES: u64 = 192 << 20;
 /// Opcode (1 byte) and length (8 bytes) in front of each record.
-const FRAMING_BYTES: usize = 9;
+pub(super) const FRAMING_BYTES: usize = 9;
 /// Part of the footer that its own CRC covers: the two offsets.
 const FOOTER_CRC_COVERS: usize = 16;
 
 /// A file being read record by record.
 pub(super) struct RecordFile {
     path: PathBuf,
-    reader: BufReader<File>,
+    reader: BufReader<Box<dyn Read>>,
     size: u64,
     /// Of the next record.
     offset: u64,
@@ -57,7 +57,13 @@ impl RecordFile {
         if !facts.is_file() {
             return Err(failed(io::Error::other("not a regular file")));
         }
-        let mut reader = BufReader::with_capacity(1 << 20, file);
+        Self::from_reader(path, Box::new(file), facts.len())
+    }
+
+    /// A recording of `size` bytes, which messages call `path`.
+    pub fn from_reader(path: &Path, reader: Box<dyn Read>, size: u64) -> Result<Self, RecordingError> {
+        let failed = |source| RecordingError::CannotRead { path: path.into(), source };
+        let mut reader = BufReader::with_capacity(1 << 20, reader);
         let mut start = Vec::new();
         reader.by_ref().take(MAGIC.len() as u64).read_to_end(&mut start).map_err(failed)?;
         if start != MAGIC {
@@ -67,7 +73,7 @@ impl RecordFile {
         let mut section_crc = crc32fast::Hasher::new();
         section_crc.update(MAGIC);
         let offset = MAGIC.len() as u64;
-        Ok(Self { path: path.into(), reader, size: facts.len(), offset, body: Vec::new(), section_crc, at_end: false })
+        Ok(Self { path: path.into(), reader, size, offset, body: Vec::new(), section_crc, at_end: false })
     }
 
     /// The next record outside chunks (a chunk counts as one), or `None` after the closing magic bytes.

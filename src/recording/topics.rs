@@ -32,16 +32,30 @@ macro_rules! topic {
     };
 }
 
-pub const CAMERA_IMAGE: Topic = topic!("/camera/image", "foxglove.CompressedImage");
-pub const GNSS_RAW: Topic = topic!("/gnss/raw", "omniloc.SerialChunk");
-pub const GNSS_FIX: Topic = topic!("/gnss/fix", "foxglove.LocationFix");
-pub const GNSS_HEADING: Topic = topic!("/gnss/heading", "omniloc.Heading");
-pub const GNSS_PULSE: Topic = topic!("/gnss/pulse", "omniloc.Pulse");
-pub const SURVEY_PAIR: Topic = topic!("/survey/pair", "omniloc.SurveyPair");
-pub const SURVEY_POSE: Topic = topic!("/survey/pose", "foxglove.PoseInFrame");
-pub const CLOCK: Topic = topic!("/clock", "omniloc.ClockOffset");
-pub const STATUS: Topic = topic!("/status", "omniloc.Status");
-pub const DROPPED: Topic = topic!("/dropped", "omniloc.Dropped");
+pub static CAMERA_IMAGE: Topic = topic!("/camera/image", "foxglove.CompressedImage");
+pub static GNSS_RAW: Topic = topic!("/gnss/raw", "omniloc.SerialChunk");
+pub static GNSS_FIX: Topic = topic!("/gnss/fix", "foxglove.LocationFix");
+pub static GNSS_HEADING: Topic = topic!("/gnss/heading", "omniloc.Heading");
+pub static GNSS_PULSE: Topic = topic!("/gnss/pulse", "omniloc.Pulse");
+pub static SURVEY_PAIR: Topic = topic!("/survey/pair", "omniloc.SurveyPair");
+pub static SURVEY_POSE: Topic = topic!("/survey/pose", "foxglove.PoseInFrame");
+pub static CLOCK: Topic = topic!("/clock", "omniloc.ClockOffset");
+pub static STATUS: Topic = topic!("/status", "omniloc.Status");
+pub static DROPPED: Topic = topic!("/dropped", "omniloc.Dropped");
+
+/// All topics, in the order a recorder declares them in.
+pub static ALL: [&Topic; 10] = [
+    &CAMERA_IMAGE,
+    &GNSS_RAW,
+    &GNSS_FIX,
+    &GNSS_HEADING,
+    &GNSS_PULSE,
+    &SURVEY_PAIR,
+    &SURVEY_POSE,
+    &CLOCK,
+    &STATUS,
+    &DROPPED,
+];
 
 /// The ENU frame of all positions.
 pub const MAP_FRAME: &str = "map";
@@ -67,4 +81,8 @@ pub mod metadata {
     pub const ORIGIN: &str = "origin";
     /// Size of the images and what is known about the camera.
     pub const CAMERA: &str = "camera";
+    /// `log_offset_ns`: log time minus stamp. Absent: they are the same.
+    pub const CLOCK: &str = "clock";
+    /// The recording was mended: what was lost.
+    pub const RECOVERY: &str = "recovery";
 }

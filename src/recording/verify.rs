@@ -2,6 +2,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    io::Read,
     path::Path,
 };
 
@@ -14,7 +15,7 @@ use super::{
     reader::{TopicSummary, is_topic},
     records::{ChannelFacts, Channels, RecordFile, parse, visit_chunk},
     scan::{count, parse_calibration},
-    topics,
+    topics::{self, metadata},
 };
 use crate::jpeg;
 
@@ -52,8 +53,17 @@ impl Verdict {
 /// # Errors
 /// Only if the file cannot be read; damage is in the verdict.
 pub fn verify(path: &Path) -> Result<Verdict, RecordingError> {
+    verify_opened(path, RecordFile::open(path))
+}
+
+/// [`verify`] of a recording of `size` bytes from anywhere; `path` is what it is called in messages.
+pub(super) fn verify_reader(path: &Path, reader: impl Read + 'static, size: u64) -> Result<Verdict, RecordingError> {
+    verify_opened(path, RecordFile::from_reader(path, Box::new(reader), size))
+}
+
+fn verify_opened(path: &Path, file: Result<RecordFile, RecordingError>) -> Result<Verdict, RecordingError> {
     let mut check = Check::default();
-    let mut file = match RecordFile::open(path) {
+    let mut file = match file {
         Err(error @ RecordingError::NotMcap { .. }) => {
             check.verdict.problem(error.to_string());
             return Ok(check.verdict);
@@ -100,6 +110,8 @@ struct Check {
     invalid_pairs: u64,
     /// Without Huffman tables.
     incomplete_images: u64,
+    /// The recording itself says that something is missing from it.
+    states_losses: bool,
 }
 
 impl Check {
@@ -119,7 +131,10 @@ impl Check {
                     self.calibration_json = Some(data.into_owned());
                 }
             }
-            Ok(Record::Metadata(_)) => drop(self.metadata.insert(offset)),
+            Ok(Record::Metadata(record)) => {
+                self.metadata.insert(offset);
+                self.states_losses |= record.name == metadata::RECOVERY;
+            }
             Ok(Record::AttachmentIndex(index)) => drop(self.indexed_attachments.insert(index.offset)),
             Ok(Record::MetadataIndex(index)) => drop(self.indexed_metadata.insert(index.offset)),
             Ok(Record::MessageIndex(index)) => self.indexed_messages += index.records.len() as u64,
@@ -193,6 +208,13 @@ impl Check {
             "foxglove.LocationFix" => drop(foxglove::LocationFix::decode(data).map_err(wrong)?),
             "foxglove.PoseInFrame" => drop(foxglove::PoseInFrame::decode(data).map_err(wrong)?),
             "omniloc.Heading" => drop(omniloc::Heading::decode(data).map_err(wrong)?),
+            "omniloc.SerialChunk" => drop(omniloc::SerialChunk::decode(data).map_err(wrong)?),
+            "omniloc.ClockOffset" => drop(omniloc::ClockOffset::decode(data).map_err(wrong)?),
+            "omniloc.Status" => drop(omniloc::Status::decode(data).map_err(wrong)?),
+            "omniloc.Dropped" => {
+                omniloc::Dropped::decode(data).map_err(wrong)?;
+                self.states_losses = true;
+            }
             other => drop(self.unknown_schemas.insert(format!("{} ({other})", channel.topic))),
         }
         Ok(())
@@ -250,7 +272,12 @@ impl Check {
         }
         let imageless = self.pairs.difference(&self.images).count();
         if imageless > 0 {
-            self.verdict.problem(format!("{imageless} pairs belong to images that are not in the recording"));
+            let text = format!("{imageless} pairs belong to images that are not in the recording");
+            if self.states_losses {
+                self.verdict.notes.push(format!("{text}, which says that it lost some"));
+            } else {
+                self.verdict.problem(text);
+            }
         }
         let pairless = self.images.difference(&self.pairs).count();
         let mut note = |count: u64, text: &str| {
@@ -353,15 +380,15 @@ mod tests {
             ("no image", |rec| rec.write_pair(1, 0, pair(0.0)), "1 pairs belong to images that are not"),
             ("two pairs", |rec| rec.write_pair(1, 0, pair(0.0)).and(rec.write_pair(1, 0, pair(0.0))), "two pairs"),
             ("NaN", |rec| rec.write_pair(1, 0, pair(f64::NAN)), "not a number"),
-            ("damaged", |rec| rec.write_image(1, 0, picture(16)[..100].to_vec()), "image 1: truncated"),
+            ("damaged", |rec| rec.write_image(1, 0, &picture(16)[..100]), "image 1: truncated"),
             (
                 "sizes",
-                |rec| rec.write_image(1, 0, picture(16)).and(rec.write_image(2, 0, picture(24))),
+                |rec| rec.write_image(1, 0, &picture(16)).and(rec.write_image(2, 0, &picture(24))),
                 "like the first",
             ),
             (
                 "order",
-                |rec| rec.write_image(2, 5, picture(16)).and(rec.write_image(1, 4, picture(16))),
+                |rec| rec.write_image(2, 5, &picture(16)).and(rec.write_image(1, 4, &picture(16))),
                 "before image 2",
             ),
         ];
