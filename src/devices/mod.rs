@@ -11,6 +11,11 @@
 //! never blocks. A device decides nothing about what its values mean: bytes of the serial line are decoded, checked and
 //! paired elsewhere, so that a replayed drive takes the same way as a live one.
 
+pub mod camera_v4l2;
+
+pub mod mjpeg;
+pub mod yuyv;
+
 use std::{
     path::PathBuf,
     sync::{Arc, Condvar, Mutex, PoisonError},

@@ -3,7 +3,7 @@
 //! Webcams send "MJPEG": JPEG frames that may leave out the Huffman tables (DHT), because all use the same ones, those of
 //! annex K.3. Recordings always hold complete images, so that any program can open them.
 
-use std::borrow::Cow;
+use std::{borrow::Cow, sync::LazyLock};
 
 /// What the headers of an image say.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,11 +59,20 @@ pub fn with_huffman_tables(jpeg: &[u8]) -> Result<Cow<'_, [u8]>, MarkerError> {
         return Ok(Cow::Borrowed(jpeg));
     }
     let (header, scan) = jpeg.split_at(scan_offset);
-    Ok(Cow::Owned([header, &standard_huffman_segment(), scan].concat()))
+    Ok(Cow::Owned([header, standard_huffman_segment(), scan].concat()))
 }
 
-/// The headers, and the offset of the first SOS marker.
+/// The headers of a whole image, and the offset of the first SOS marker.
 fn walk(jpeg: &[u8]) -> Result<(JpegInfo, usize), MarkerError> {
+    let header = scan_header(jpeg)?;
+    check_end(jpeg)?;
+    Ok(header)
+}
+
+/// What the headers say, and the offset of the marker that begins the image data (SOS); missing tables belong before it.
+///
+/// What follows that marker is not looked at: the image may be cut off.
+pub fn scan_header(jpeg: &[u8]) -> Result<(JpegInfo, usize), MarkerError> {
     if jpeg.is_empty() {
         return Err(MarkerError::Empty);
     }
@@ -102,7 +111,6 @@ fn walk(jpeg: &[u8]) -> Result<(JpegInfo, usize), MarkerError> {
         match marker {
             SOS => {
                 let (width_px, height_px, components) = frame.ok_or_else(|| bad("image data before the image size"))?;
-                check_end(jpeg)?;
                 return Ok((JpegInfo { width_px, height_px, components, has_huffman_tables }, marker_offset));
             }
             DHT => has_huffman_tables = true,
@@ -161,7 +169,12 @@ fn kind_of(bytes: &[u8]) -> &'static str {
 }
 
 /// DHT with the four tables of T.81 annex K.3 (K.3 to K.6), which MJPEG implies.
-fn standard_huffman_segment() -> Vec<u8> {
+pub fn standard_huffman_segment() -> &'static [u8] {
+    static SEGMENT: LazyLock<Vec<u8>> = LazyLock::new(build_standard_huffman_segment);
+    &SEGMENT
+}
+
+fn build_standard_huffman_segment() -> Vec<u8> {
     let tables: [(u8, &[u8; 16], &[u8]); 4] = [
         (0x00, &DC_LUMA_COUNTS, &DC_VALUES),
         (0x10, &AC_LUMA_COUNTS, &AC_LUMA_VALUES),

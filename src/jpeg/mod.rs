@@ -4,4 +4,4 @@ mod decode;
 mod markers;
 
 pub use decode::{JpegError, LumaDecoder, MAX_SIDE_PX};
-pub use markers::{JpegInfo, MarkerError, scan, with_huffman_tables};
+pub use markers::{JpegInfo, MarkerError, scan, scan_header, standard_huffman_segment, with_huffman_tables};
