@@ -42,17 +42,8 @@ pub static STATUS: Topic = topic!("/status", "omniloc.Status");
 pub static DROPPED: Topic = topic!("/dropped", "omniloc.Dropped");
 
 /// All topics, in the order a recorder declares them in.
-pub static ALL: [&Topic; 9] = [
-    &CAMERA_IMAGE,
-    &GNSS_RAW,
-    &GNSS_FIX,
-    &GNSS_HEADING,
-    &SURVEY_PAIR,
-    &SURVEY_POSE,
-    &CLOCK,
-    &STATUS,
-    &DROPPED,
-];
+pub static ALL: [&Topic; 9] =
+    [&CAMERA_IMAGE, &GNSS_RAW, &GNSS_FIX, &GNSS_HEADING, &SURVEY_PAIR, &SURVEY_POSE, &CLOCK, &STATUS, &DROPPED];
 
 /// The ENU frame of all positions.
 pub const MAP_FRAME: &str = "map";
