@@ -30,6 +30,8 @@ pub struct Verdict {
     pub messages: u64,
     pub images: u64,
     pub pairs: u64,
+    /// The file is whole, and its indexes agree with what is in it. Contents may still have problems.
+    pub is_complete: bool,
 }
 
 impl Verdict {
@@ -267,8 +269,10 @@ impl Check {
 
     fn finish(mut self, path: &Path) -> Verdict {
         if !self.was_cut {
+            let problems = self.verdict.problems.len() as u64 + self.verdict.unlisted_problems;
             self.compare_with_statistics();
             self.compare_with_indexes();
+            self.verdict.is_complete = self.verdict.problems.len() as u64 + self.verdict.unlisted_problems == problems;
         }
         let imageless = self.pairs.difference(&self.images).count();
         if imageless > 0 {

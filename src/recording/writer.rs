@@ -110,10 +110,8 @@ impl<W: Write + Seek> RecordingWriter<W> {
     ) -> Result<(), McapError> {
         let channel_id = self.channel(topic)?;
         let log_time = stamp_ns.saturating_add(self.log_offset_ns);
-        self.mcap.write_to_known_channel(
-            &MessageHeader { channel_id, sequence, log_time, publish_time: stamp_ns },
-            message,
-        )
+        self.mcap
+            .write_to_known_channel(&MessageHeader { channel_id, sequence, log_time, publish_time: stamp_ns }, message)
     }
 
     /// The timestamp that a message with this stamp carries.
@@ -297,7 +295,8 @@ mod tests {
     #[test]
     fn an_image_is_encoded_as_prost_does_it() {
         let mut encoded = vec![1, 2, 3];
-        for (stamp_ns, length) in [(0, 0), (1, 1), (1_700_000_000_123_456_789, 127), (5, 128), (1_000_000_000, 200_000)] {
+        for (stamp_ns, length) in [(0, 0), (1, 1), (1_700_000_000_123_456_789, 127), (5, 128), (1_000_000_000, 200_000)]
+        {
             let image = foxglove::CompressedImage {
                 timestamp: Some(timestamp(stamp_ns)),
                 data: (0..length).map(|i| i as u8).collect(),
@@ -319,7 +318,8 @@ mod tests {
 
     #[test]
     fn log_time_is_the_stamp_plus_the_offset() {
-        let mut recording = RecordingWriter::appending(Cursor::new(Vec::new()), 1_700_000_000_000_000_001).expect("starts");
+        let mut recording =
+            RecordingWriter::appending(Cursor::new(Vec::new()), 1_700_000_000_000_000_001).expect("starts");
         recording.write_pair(3, 5_000_000_000, omniloc::SurveyPair::default()).expect("writes");
         let bytes = recording.finish().expect("finishes").into_inner();
         assert_eq!(times(&bytes), (1_700_000_005_000_000_001, 5_000_000_000, 1_700_000_005_000_000_001));

@@ -1,0 +1,541 @@
+//! Goes through a damaged recording and hands on what is whole.
+
+use std::{
+    collections::BTreeMap,
+    io::{self, Read, Seek},
+};
+
+use mcap::{
+    MAGIC,
+    records::{MessageHeader, Record, op},
+};
+use prost::Message;
+
+use super::{LostSpan, Recovery, Sink, StreamError, window::Window};
+use crate::{
+    jpeg,
+    recording::{
+        proto::{foxglove, omniloc},
+        reader::TopicSummary,
+        records::{FRAMING_BYTES, MAX_RECORD_BYTES, parse, visit_chunk},
+    },
+};
+
+const FRAMING: u64 = FRAMING_BYTES as u64;
+/// Fixed part of a chunk's header: times, sizes, CRC, and the length of the compression's name.
+const CHUNK_HEADER_BYTES: u64 = 8 + 8 + 8 + 4 + 4 + 8;
+/// No compression has a longer name.
+const MAX_COMPRESSION_NAME_BYTES: u64 = 16;
+/// A larger jump of the sequence numbers is a new count, not a loss.
+const MAX_GAP: u32 = 100_000;
+
+/// How much is known about the bytes at hand.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Trust {
+    /// Found behind damage, by its looks.
+    Damaged,
+    /// Nothing was wrong so far, but no CRC says so.
+    Plain,
+    /// A CRC fits.
+    Proven,
+}
+
+/// What the bytes at an offset are.
+enum Step {
+    /// Dealt with; go on there.
+    Next(u64),
+    /// No record.
+    Lost,
+    /// Only indexes follow.
+    End,
+}
+
+/// Copies all that is whole from `input` to `sink`.
+pub(super) fn walk<R: Read + Seek>(
+    input: R,
+    before_read: &mut dyn FnMut() -> io::Result<()>,
+    sink: &mut impl Sink,
+) -> Result<Recovery, StreamError> {
+    let window = Window::new(input, before_read).map_err(StreamError::Read)?;
+    // Enough for any real damage; forged records that each claim the rest of the file must not take forever.
+    let budget_bytes = window.size.saturating_mul(16).saturating_add(64 << 20);
+    let mut walk = Walk {
+        window,
+        sink,
+        recovery: Recovery::default(),
+        trust: Trust::Plain,
+        schemas: BTreeMap::new(),
+        channels: BTreeMap::new(),
+        last_log_ns: None,
+        budget_bytes,
+        body: Vec::new(),
+    };
+    walk.run()?;
+    Ok(walk.finish())
+}
+
+struct Walk<'a, R: Read + Seek, S: Sink> {
+    window: Window<'a, R>,
+    sink: &'a mut S,
+    recovery: Recovery,
+    trust: Trust,
+    /// Names.
+    schemas: BTreeMap<u16, String>,
+    channels: BTreeMap<u16, Channel>,
+    last_log_ns: Option<u64>,
+    /// Bytes that may still be looked at in vain.
+    budget_bytes: u64,
+    body: Vec<u8>,
+}
+
+struct Channel {
+    topic: String,
+    schema_name: String,
+    last_sequence: Option<u32>,
+    /// Something was lost since the last message.
+    behind_loss: bool,
+    /// Messages of it that were found damaged since then.
+    damaged: u64,
+}
+
+impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
+    fn run(&mut self) -> Result<(), StreamError> {
+        let size = self.window.size;
+        let mut offset = 0;
+        if self.get(0, MAGIC.len() as u64)? == MAGIC {
+            offset = MAGIC.len() as u64;
+            self.read_summary()?;
+        } else {
+            self.trust = Trust::Damaged;
+        }
+        while offset < size {
+            match self.step(offset)? {
+                Step::Next(next) => offset = next,
+                Step::End => return Ok(()),
+                Step::Lost => {
+                    let next = self.find_record(offset + 1)?;
+                    self.lose(offset, next)?;
+                    self.trust = Trust::Damaged;
+                    offset = next;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(mut self) -> Recovery {
+        for channel in std::mem::take(&mut self.channels).into_values() {
+            if channel.damaged > 0 {
+                *self.recovery.lost_messages.entry(channel.topic).or_default() += channel.damaged;
+            }
+        }
+        self.recovery.unreadable_bytes = self.window.unreadable_bytes;
+        self.recovery
+    }
+
+    fn get(&mut self, offset: u64, length: u64) -> Result<&[u8], StreamError> {
+        self.window.get(offset, length).map_err(StreamError::Read)
+    }
+
+    /// Opcode and length of a body that may or may not be there.
+    fn framing(&mut self, offset: u64) -> Result<Option<(u8, u64)>, StreamError> {
+        let bytes = self.get(offset, FRAMING)?;
+        Ok(bytes.first_chunk::<FRAMING_BYTES>().map(|&[opcode, length @ ..]| (opcode, u64::from_le_bytes(length))))
+    }
+
+    /// Whether a record may start here: the one before it then had the right length.
+    fn may_start_record(&mut self, offset: u64) -> Result<bool, StreamError> {
+        let rest = self.window.size.saturating_sub(offset);
+        if rest == 0 {
+            return Ok(true);
+        }
+        if rest < FRAMING {
+            return Ok(MAGIC.starts_with(self.get(offset, rest)?) || op_is_known(self.get(offset, 1)?[0]));
+        }
+        Ok(match self.framing(offset)? {
+            Some((op::CHUNK, _)) => true,
+            Some((opcode, length)) => op_is_known(opcode) && length <= rest - FRAMING,
+            None => false,
+        })
+    }
+
+    fn step(&mut self, offset: u64) -> Result<Step, StreamError> {
+        let Some((opcode, length)) = self.framing(offset)? else {
+            let rest = self.window.size - offset;
+            // The closing magic bytes without the footer before them cannot be; a few bytes of a record can.
+            return Ok(if MAGIC.starts_with(self.get(offset, rest)?) { Step::End } else { Step::Lost });
+        };
+        if opcode == op::CHUNK {
+            return self.chunk(offset, length);
+        }
+        let rest = self.window.size - offset - FRAMING;
+        if length > rest.min(MAX_RECORD_BYTES) {
+            // An index that was cut off holds no data.
+            let cut_index = opcode == op::MESSAGE_INDEX && self.trust == Trust::Proven && length <= MAX_RECORD_BYTES;
+            return Ok(if cut_index { Step::End } else { Step::Lost });
+        }
+        let next = offset + FRAMING + length;
+        match opcode {
+            op::SCHEMA | op::CHANNEL | op::MESSAGE | op::METADATA | op::ATTACHMENT => {}
+            op::DATA_END if length != 4 => return Ok(Step::Lost),
+            op::FOOTER if length != 20 => return Ok(Step::Lost),
+            _ if !op_is_known(opcode) || !self.may_start_record(next)? => return Ok(Step::Lost),
+            op::DATA_END | op::FOOTER => {
+                self.recovery.reached_the_end = true;
+                return Ok(Step::End);
+            }
+            _ => return Ok(Step::Next(next)),
+        }
+        let mut body = std::mem::take(&mut self.body);
+        body.clear();
+        body.extend_from_slice(self.get(offset + FRAMING, length)?);
+        let holed = self.window.touches_zero_sector(offset, next - offset).map_err(StreamError::Read)?;
+        // Attachments have a CRC of their own.
+        let whole = (!holed || opcode == op::ATTACHMENT) && self.record(opcode, &body, self.trust)?;
+        if !whole && opcode == op::MESSAGE {
+            self.note_damaged(&body);
+        }
+        self.body = body;
+        if whole {
+            return Ok(Step::Next(next));
+        }
+        if !self.may_start_record(next)? {
+            return Ok(Step::Lost);
+        }
+        self.lose(offset, next)?;
+        Ok(Step::Next(next))
+    }
+
+    fn chunk(&mut self, offset: u64, length: u64) -> Result<Step, StreamError> {
+        let Some(header) = self.chunk_header(offset, length)? else { return Ok(Step::Lost) };
+        let inside = offset + FRAMING + header.bytes;
+        let size = self.window.size;
+        let Some(end) = (offset + FRAMING).checked_add(length).filter(|&end| end <= size) else {
+            if header.is_compressed {
+                self.lose(offset, size)?;
+                return Ok(Step::Next(size));
+            }
+            self.trust = self.trust.min(Trust::Plain);
+            return Ok(Step::Next(inside));
+        };
+        if length > MAX_RECORD_BYTES {
+            return Ok(Step::Lost);
+        }
+        let mut body = std::mem::take(&mut self.body);
+        body.clear();
+        body.extend_from_slice(self.get(offset + FRAMING, length)?);
+        let trust = if header.has_crc { Trust::Proven } else { self.trust.min(Trust::Plain) };
+        let mut visited = 0;
+        let mut failed = None;
+        let mut refused = false;
+        let outcome = visit_chunk(&body, |opcode, body| {
+            visited += 1;
+            match self.record(opcode, body, trust) {
+                Ok(whole) => refused |= !whole,
+                Err(error) => failed = Some(error),
+            }
+            if failed.is_some() { Err(String::new()) } else { Ok(()) }
+        });
+        self.body = body;
+        if let Some(error) = failed {
+            return Err(error);
+        }
+        if refused || (outcome.is_err() && visited > 0) {
+            // A chunk with a fitting CRC that contradicts itself was written so.
+            self.lose(offset, end)?;
+            return Ok(Step::Next(end));
+        }
+        if outcome.is_ok() {
+            self.trust = trust;
+            return Ok(Step::Next(end));
+        }
+        if !header.is_compressed && self.window.touches_zero_sector(inside, end - inside).map_err(StreamError::Read)? {
+            self.trust = Trust::Plain.min(self.trust);
+            return Ok(Step::Next(inside));
+        }
+        self.lose(offset, end)?;
+        self.count_messages(inside, end)?;
+        Ok(Step::Next(end))
+    }
+
+    /// `None`: no chunk starts here.
+    fn chunk_header(&mut self, offset: u64, length: u64) -> Result<Option<ChunkHeader>, StreamError> {
+        let bytes = self.get(offset + FRAMING, CHUNK_HEADER_BYTES + MAX_COMPRESSION_NAME_BYTES)?;
+        let number =
+            |at: usize| bytes.get(at..at + 8).map(|bytes| u64::from_le_bytes(bytes.try_into().expect("8 bytes")));
+        let header = || {
+            let name_bytes = number(24)? >> 32; // behind the CRC
+            let name_end = 32 + usize::try_from(name_bytes).ok().filter(|&n| n as u64 <= MAX_COMPRESSION_NAME_BYTES)?;
+            let (first_ns, last_ns, data_bytes) = (number(0)?, number(8)?, number(name_end)?);
+            let bytes = CHUNK_HEADER_BYTES + name_bytes;
+            // A chunk that was being written in place has its sizes filled in last.
+            let unfinished = length == u64::MAX && data_bytes == u64::MAX;
+            let consistent = bytes.checked_add(data_bytes) == Some(length) && first_ns <= last_ns;
+            let is_compressed = name_bytes > 0;
+            let has_crc = number(24)? as u32 != 0;
+            (unfinished || consistent).then_some(ChunkHeader { bytes, is_compressed, has_crc })
+        };
+        Ok(header())
+    }
+
+    /// Takes a record; `false` if it is not whole or contradicts what came before.
+    fn record(&mut self, opcode: u8, body: &[u8], trust: Trust) -> Result<bool, StreamError> {
+        let Ok(record) = parse(opcode, body) else { return Ok(false) };
+        match record {
+            Record::Schema { header, data } => {
+                let accepted = self.sink.schema(header.id, &header.name, &header.encoding, &data)?;
+                if accepted {
+                    self.schemas.insert(header.id, header.name);
+                }
+                Ok(accepted)
+            }
+            Record::Channel(record) => {
+                let accepted = self.sink.channel(&record)?;
+                if accepted {
+                    let schema_name = self.schemas.get(&record.schema_id).cloned().unwrap_or_default();
+                    self.channels.entry(record.id).or_insert_with(|| Channel {
+                        topic: record.topic,
+                        schema_name,
+                        last_sequence: None,
+                        behind_loss: false,
+                        damaged: 0,
+                    });
+                }
+                Ok(accepted)
+            }
+            Record::Message { header, data } => {
+                let Some(channel) = self.channels.get(&header.channel_id) else { return Ok(false) };
+                if !is_whole(channel, &header, &data, trust) {
+                    return Ok(false);
+                }
+                self.sink.message(&header, &data)?;
+                self.note_message(&header);
+                Ok(true)
+            }
+            Record::Metadata(record) => self.sink.metadata(&record).map(|()| true),
+            Record::Attachment { header, data, .. } => {
+                let (name, media_type) = (header.name, header.media_type);
+                let (log_time, create_time) = (header.log_time, header.create_time);
+                self.sink.attachment(&mcap::Attachment { log_time, create_time, name, media_type, data })?;
+                Ok(true)
+            }
+            _ => Ok(true),
+        }
+    }
+
+    fn note_message(&mut self, header: &MessageHeader) {
+        let (recovery, stamp_ns) = (&mut self.recovery, header.log_time);
+        recovery.messages += 1;
+        let channel = self.channels.get_mut(&header.channel_id).expect("the caller looked it up");
+        let new = || TopicSummary {
+            schema_name: channel.schema_name.clone(),
+            messages: 0,
+            first_ns: stamp_ns,
+            last_ns: stamp_ns,
+        };
+        match recovery.topics.get_mut(&channel.topic) {
+            Some(topic) => {
+                topic.messages += 1;
+                topic.first_ns = topic.first_ns.min(stamp_ns);
+                topic.last_ns = topic.last_ns.max(stamp_ns);
+            }
+            None => drop(recovery.topics.insert(channel.topic.clone(), TopicSummary { messages: 1, ..new() })),
+        }
+        if let Some(span) = recovery.spans.last_mut()
+            && span.before_ns.is_none()
+        {
+            span.before_ns = Some(stamp_ns);
+        }
+        self.last_log_ns = Some(stamp_ns);
+        if channel.behind_loss {
+            let after_last = channel.last_sequence.and_then(|last| header.sequence.checked_sub(last)?.checked_sub(1));
+            let skipped = after_last.filter(|&gap| gap <= MAX_GAP).unwrap_or(0);
+            let lost = u64::from(skipped).max(channel.damaged);
+            if lost > 0 {
+                *recovery.lost_messages.entry(channel.topic.clone()).or_default() += lost;
+            }
+            (channel.behind_loss, channel.damaged) = (false, 0);
+        }
+        channel.last_sequence = Some(header.sequence);
+    }
+
+    fn note_damaged(&mut self, body: &[u8]) {
+        if let Ok(Record::Message { header, .. }) = parse(op::MESSAGE, body)
+            && let Some(channel) = self.channels.get_mut(&header.channel_id)
+        {
+            channel.damaged += 1;
+        }
+    }
+
+    /// Counts the messages of a chunk that is not used, as far as it can be followed.
+    fn count_messages(&mut self, mut offset: u64, end: u64) -> Result<(), StreamError> {
+        while let Some((opcode, length)) = self.framing(offset)? {
+            let Some(next) = offset.checked_add(FRAMING + length.min(end)).filter(|&next| next <= end) else { break };
+            if opcode == op::MESSAGE {
+                let body = self.get(offset + FRAMING, length.min(MESSAGE_HEADER_BYTES))?.to_vec();
+                self.note_damaged(&body);
+            }
+            offset = next;
+        }
+        Ok(())
+    }
+
+    fn lose(&mut self, from: u64, to: u64) -> Result<(), StreamError> {
+        self.channels.values_mut().for_each(|channel| channel.behind_loss = true);
+        self.recovery.lost_bytes += to - from;
+        let mut at = from;
+        while at < to {
+            let piece = self.window.piece(at).map_err(StreamError::Read)?;
+            let piece = &piece[..piece.len().min((to - at) as usize)];
+            self.recovery.zero_bytes += piece.iter().filter(|&&byte| byte == 0).count() as u64;
+            at += piece.len() as u64;
+        }
+        let spans = &mut self.recovery.spans;
+        let is_full = spans.len() == Recovery::MAX_SPANS;
+        match spans.last_mut() {
+            Some(span) if span.before_ns.is_none() => span.bytes = to - span.offset,
+            _ if is_full => {}
+            _ => {
+                let after_ns = self.last_log_ns;
+                spans.push(LostSpan { offset: from, bytes: to - from, after_ns, before_ns: None });
+            }
+        }
+        Ok(())
+    }
+
+    /// The next place that can only be a record: a chunk, or a message of ours with its time in it twice.
+    fn find_record(&mut self, from: u64) -> Result<u64, StreamError> {
+        let size = self.window.size;
+        let mut offset = from;
+        while offset < size {
+            let piece = self.window.piece(offset).map_err(StreamError::Read)?;
+            let (searched, found) = match find_candidate(piece) {
+                Some(at) => (at as u64, true),
+                None => ((piece.len() - (FRAMING_BYTES - 1).min(piece.len() - 1)) as u64, false),
+            };
+            offset += searched;
+            if found {
+                if self.is_record(offset)? {
+                    return Ok(offset);
+                }
+                if self.budget_bytes == 0 {
+                    return Ok(size);
+                }
+                offset += 1;
+            } else if size - offset < FRAMING {
+                return Ok(size);
+            }
+        }
+        Ok(size)
+    }
+
+    fn is_record(&mut self, offset: u64) -> Result<bool, StreamError> {
+        let Some((opcode, length)) = self.framing(offset)? else { return Ok(false) };
+        if opcode == op::CHUNK {
+            return Ok(self.chunk_header(offset, length)?.is_some());
+        }
+        if length > self.window.size - offset - FRAMING {
+            return Ok(false);
+        }
+        let header = self.get(offset + FRAMING, MESSAGE_HEADER_BYTES)?;
+        let known = header.first_chunk::<2>().map(|&id| u16::from_le_bytes(id));
+        if length < MESSAGE_HEADER_BYTES || !known.is_some_and(|id| self.channels.contains_key(&id)) {
+            return Ok(false);
+        }
+        self.budget_bytes = self.budget_bytes.saturating_sub(length);
+        if self.budget_bytes == 0 {
+            return Ok(false);
+        }
+        let body = self.window.get(offset + FRAMING, length).map_err(StreamError::Read)?;
+        let Ok(Record::Message { header, data }) = parse(opcode, body) else { return Ok(false) };
+        let channel = self.channels.get(&header.channel_id).expect("looked up above");
+        Ok(is_whole(channel, &header, &data, Trust::Damaged))
+    }
+
+    /// Schemas and channels from the end of the file, in case the chunk that has them at the start is lost.
+    fn read_summary(&mut self) -> Result<(), StreamError> {
+        const FOOTER_BODY_BYTES: u64 = 20;
+        let size = self.window.size;
+        let tail_bytes = FRAMING + FOOTER_BODY_BYTES + MAGIC.len() as u64;
+        let Some(footer_at) = size.checked_sub(tail_bytes) else { return Ok(()) };
+        let tail = self.get(footer_at, tail_bytes)?;
+        if tail[0] != op::FOOTER || !tail.ends_with(MAGIC) {
+            return Ok(());
+        }
+        let start = u64::from_le_bytes(tail[9..17].try_into().expect("8 bytes"));
+        let crc = u32::from_le_bytes(tail[25..29].try_into().expect("4 bytes"));
+        if start < MAGIC.len() as u64 || start > footer_at || footer_at - start > MAX_RECORD_BYTES {
+            return Ok(());
+        }
+        let covered = self.get(start, footer_at + 25 - start)?;
+        if crc == 0 || crc32fast::hash(covered) != crc {
+            return Ok(());
+        }
+        let summary = covered[..(footer_at - start) as usize].to_vec();
+        let mut rest = summary.as_slice();
+        while let Some((&[opcode, length @ ..], after)) = rest.split_first_chunk::<FRAMING_BYTES>() {
+            let length = usize::try_from(u64::from_le_bytes(length)).ok();
+            let Some((body, after)) = length.and_then(|length| after.split_at_checked(length)) else { break };
+            if matches!(opcode, op::SCHEMA | op::CHANNEL) {
+                self.record(opcode, body, Trust::Proven)?;
+            }
+            rest = after;
+        }
+        Ok(())
+    }
+}
+
+struct ChunkHeader {
+    bytes: u64,
+    is_compressed: bool,
+    has_crc: bool,
+}
+
+/// Channel, sequence number, log time, publish time.
+const MESSAGE_HEADER_BYTES: u64 = 2 + 4 + 8 + 8;
+
+fn op_is_known(opcode: u8) -> bool {
+    (op::HEADER..=op::DATA_END).contains(&opcode) || opcode >= 0x80
+}
+
+/// Where a chunk or message of less than 4 GiB may start.
+fn find_candidate(bytes: &[u8]) -> Option<usize> {
+    bytes.windows(FRAMING_BYTES).position(|framing| {
+        matches!(framing[0], op::CHUNK | op::MESSAGE) && framing[5..] == [0; 4] && framing[1..5] != [0; 4]
+    })
+}
+
+/// Whether a message can be what was written. Nothing can be said of a schema that is not ours.
+fn is_whole(channel: &Channel, header: &MessageHeader, data: &[u8], trust: Trust) -> bool {
+    if trust == Trust::Proven {
+        return true;
+    }
+    let Some(decoded) = decode(&channel.schema_name, data) else { return trust == Trust::Plain };
+    let Ok((timestamp, image_is_whole)) = decoded else { return false };
+    let time_ns = timestamp.map(|time| i128::from(time.seconds) * 1_000_000_000 + i128::from(time.nanos));
+    trust == Trust::Plain || (time_ns == Some(header.log_time.into()) && image_is_whole)
+}
+
+type Decoded = Result<(Option<prost_types::Timestamp>, bool), prost::DecodeError>;
+
+/// A message's own timestamp, and whether the image in it, if there is one, is whole. `None`: not a schema of ours.
+fn decode(schema_name: &str, data: &[u8]) -> Option<Decoded> {
+    macro_rules! timestamp {
+        ($message:ty) => {
+            <$message>::decode(data).map(|message| (message.timestamp, true))
+        };
+    }
+    Some(match schema_name {
+        "foxglove.CompressedImage" => foxglove::CompressedImage::decode(data)
+            .map(|image| (image.timestamp, image.format != "jpeg" || jpeg::scan(&image.data).is_ok())),
+        "foxglove.LocationFix" => timestamp!(foxglove::LocationFix),
+        "foxglove.PoseInFrame" => timestamp!(foxglove::PoseInFrame),
+        "omniloc.SerialChunk" => timestamp!(omniloc::SerialChunk),
+        "omniloc.Heading" => timestamp!(omniloc::Heading),
+        "omniloc.SurveyPair" => timestamp!(omniloc::SurveyPair),
+        "omniloc.ClockOffset" => timestamp!(omniloc::ClockOffset),
+        "omniloc.Status" => timestamp!(omniloc::Status),
+        "omniloc.Dropped" => timestamp!(omniloc::Dropped),
+        _ => return None,
+    })
+}
