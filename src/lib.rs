@@ -18,6 +18,7 @@
 //! | [`types`] | words every folder may use: positions, calibration, images |
 //! | [`devices`] | hardware in, stamped values out |
 //! | [`recording`] | MCAP on disk; import and export of image folders |
+//! | [`sync`] | where the vehicle was when a frame was exposed |
 //! | [`jpeg`] | JPEG in, luma out |
 //! | [`calibrate`] | finds the donut in the image |
 //! | [`panorama`] | unwraps the donut |
@@ -52,5 +53,6 @@ pub mod map;
 pub mod metrics;
 pub mod panorama;
 pub mod recording;
+pub mod sync;
 pub mod train;
 pub mod types;

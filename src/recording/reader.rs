@@ -172,6 +172,17 @@ impl Recording {
     /// Every image in file order, whether a position is known or not, with its frame number and stamp \[ns\]: to
     /// calibrate on a recording. `visit` returns `false` to stop.
     pub fn for_each_image(path: &Path, mut visit: impl FnMut(u32, u64, &[u8]) -> bool) -> Result<(), RecordingError> {
+        Self::for_each_message(path, &topics::CAMERA_IMAGE, |header, data| {
+            Ok(visit(header.sequence, header.publish_time, &decode_image(header, data)?))
+        })
+    }
+
+    /// Every message of a topic in file order. `visit` returns `false` to stop, or what is wrong with the message.
+    pub fn for_each_message(
+        path: &Path,
+        topic: &topics::Topic,
+        mut visit: impl FnMut(&MessageHeader, &[u8]) -> Result<bool, String>,
+    ) -> Result<(), RecordingError> {
         let mut file = RecordFile::open(path)?;
         let mut channels = Channels::default();
         let mut going = true;
@@ -179,8 +190,8 @@ impl Recording {
             let offset = record.offset;
             let mut read = |opcode: u8, body: &[u8]| {
                 channels.read_record(opcode, body, |channel, header, data| {
-                    if going && is_topic(channel, &topics::CAMERA_IMAGE) {
-                        going = visit(header.sequence, header.publish_time, &decode_image(header, data)?);
+                    if going && is_topic(channel, topic) {
+                        going = visit(header, data)?;
                     }
                     Ok(())
                 })

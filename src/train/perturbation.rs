@@ -120,7 +120,7 @@ fn azimuth(column: usize) -> f32 {
 }
 
 /// A standard normal number (Box & Muller 1958).
-pub(super) fn standard_normal(random: &mut ChaCha8Rng) -> f32 {
+pub(crate) fn standard_normal(random: &mut ChaCha8Rng) -> f32 {
     let radius = (-2.0 * (1.0 - random.random::<f32>()).ln()).sqrt();
     radius * (TAU * random.random::<f32>()).cos()
 }

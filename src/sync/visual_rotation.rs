@@ -1,0 +1,261 @@
+//! By how much the camera turned between two frames, from their panoramas.
+
+use std::{
+    f64::consts::{PI, TAU},
+    sync::Arc,
+};
+
+use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+
+use crate::{
+    panorama::{Panorama, WIDE_COLUMNS, WIDE_ROWS},
+    types::{AzimuthSense, wrap_angle_rad},
+};
+
+/// The panorama in rings, each averaged over its rows.
+const RINGS: usize = 8;
+const ROWS_PER_RING: usize = WIDE_ROWS / RINGS;
+const HARMONICS: usize = WIDE_COLUMNS / 2 + 1;
+/// Slower harmonics are light and sky, faster ones noise.
+const USED: std::ops::Range<usize> = 4..160;
+/// The correlation of the two frames, 1 for equal ones, must be at least this.
+const MIN_QUALITY: f64 = 0.5;
+/// And this many times the highest one elsewhere: repeated windows look alike.
+const MIN_LEAD: f64 = 1.1;
+/// "Elsewhere" begins this far from the peak \[columns\].
+const PEAK_COLUMNS: usize = 12;
+/// Steps of Newton's method from the highest column to the peak; two are enough.
+const NEWTON_STEPS: usize = 3;
+
+/// How the vehicle turned between two frames.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VisualRotation {
+    pub from_ns: u64,
+    pub to_ns: u64,
+    /// Counter-clockwise.
+    pub rotation_rad: f64,
+    /// Correlation of the two frames, up to 1.
+    pub quality: f64,
+}
+
+/// Compares each frame with the one before.
+///
+/// Turning the vehicle shifts the columns of the panorama. With Aᵣ and Bᵣ the spectra of ring r of the two frames, less
+/// the slow and the very fast harmonics, the correlation at a shift of s columns is
+///
+/// ```text
+/// c(s) = Σᵣ Σₖ Re(Aᵣₖ* Bᵣₖ e^{2πi k s / W}) / √(Σ|A|² Σ|B|²)
+/// ```
+///
+/// Its highest column comes from one inverse transform, its peak between columns from Newton's method on the sum itself,
+/// which is exact: no error that depends on where between two columns the peak lies.
+pub struct RotationTracker {
+    azimuth: AzimuthSense,
+    forward: Arc<dyn RealToComplex<f64>>,
+    inverse: Arc<dyn ComplexToReal<f64>>,
+    ring: Vec<f64>,
+    cross: Vec<Complex<f64>>,
+    spectrum: Vec<Complex<f64>>,
+    correlation: Vec<f64>,
+    scratch: Vec<Complex<f64>>,
+    before: Option<Profile>,
+    spare: Option<Profile>,
+}
+
+/// The spectra of one frame's rings, one after the other.
+struct Profile {
+    stamp_ns: u64,
+    spectra: Vec<Complex<f64>>,
+    energy: f64,
+}
+
+impl RotationTracker {
+    /// `azimuth`: which way the columns run.
+    pub fn new(azimuth: AzimuthSense) -> Self {
+        let mut planner = RealFftPlanner::new();
+        let forward = planner.plan_fft_forward(WIDE_COLUMNS);
+        let inverse = planner.plan_fft_inverse(WIDE_COLUMNS);
+        let scratch_length = forward.get_scratch_len().max(inverse.get_scratch_len());
+        Self {
+            azimuth,
+            ring: forward.make_input_vec(),
+            cross: inverse.make_input_vec(),
+            spectrum: forward.make_output_vec(),
+            correlation: inverse.make_output_vec(),
+            scratch: vec![Complex::ZERO; scratch_length],
+            forward,
+            inverse,
+            before: None,
+            spare: None,
+        }
+    }
+
+    /// The rotation since the frame before. `None`: there was none, or the two do not show it.
+    pub fn push(&mut self, stamp_ns: u64, panorama: &Panorama) -> Option<VisualRotation> {
+        let mut profile = self.spare.take().unwrap_or_else(Profile::zeros);
+        self.describe(stamp_ns, panorama, &mut profile);
+        let before = self.before.take();
+        let rotation = before.as_ref().and_then(|before| self.between(before, &profile));
+        self.spare = before;
+        self.before = Some(profile);
+        rotation
+    }
+
+    /// The next frame has none before it.
+    pub fn restart(&mut self) {
+        self.spare = self.before.take().or(self.spare.take());
+    }
+
+    fn describe(&mut self, stamp_ns: u64, panorama: &Panorama, profile: &mut Profile) {
+        profile.stamp_ns = stamp_ns;
+        profile.energy = 0.0;
+        let rings = panorama.wide.chunks_exact(WIDE_COLUMNS * ROWS_PER_RING);
+        for (rows, spectrum) in rings.zip(profile.spectra.chunks_exact_mut(USED.len())) {
+            self.ring.fill(0.0);
+            for row in rows.chunks_exact(WIDE_COLUMNS) {
+                self.ring.iter_mut().zip(row).for_each(|(sum, &value)| *sum += f64::from(value));
+            }
+            self.forward
+                .process_with_scratch(&mut self.ring, &mut self.spectrum, &mut self.scratch)
+                .expect("the buffers come from the plan");
+            spectrum.copy_from_slice(&self.spectrum[USED]);
+            profile.energy += spectrum.iter().map(Complex::norm_sqr).sum::<f64>();
+        }
+    }
+
+    fn between(&mut self, from: &Profile, to: &Profile) -> Option<VisualRotation> {
+        let scale = (from.energy * to.energy).sqrt();
+        if !(scale > 0.0 && scale.is_finite()) {
+            return None;
+        }
+        self.cross.fill(Complex::ZERO);
+        let used = &mut self.cross[USED];
+        for (a, b) in from.spectra.chunks_exact(USED.len()).zip(to.spectra.chunks_exact(USED.len())) {
+            used.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum += a.conj() * b / scale);
+        }
+        let mut spectrum = std::mem::take(&mut self.spectrum);
+        spectrum.copy_from_slice(&self.cross);
+        self.inverse
+            .process_with_scratch(&mut spectrum, &mut self.correlation, &mut self.scratch)
+            .expect("the buffers come from the plan");
+        self.spectrum = spectrum;
+
+        let (column, &peak) = self.correlation.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
+        let apart = |other: usize| {
+            let apart = other.abs_diff(column);
+            apart.min(WIDE_COLUMNS - apart)
+        };
+        let elsewhere = self.correlation.iter().enumerate().filter(|(other, _)| apart(*other) > PEAK_COLUMNS);
+        let rival = elsewhere.map(|(_, &value)| value).fold(0.0, f64::max);
+        // The inverse transform counts each harmonic for itself and its conjugate.
+        let quality = peak / 2.0;
+        if quality < MIN_QUALITY || peak < MIN_LEAD * rival {
+            return None;
+        }
+        let shift_rad = self.peak_near_rad(TAU * column as f64 / WIDE_COLUMNS as f64);
+        // What the vehicle turns towards moves to lower columns where the azimuth grows with the column.
+        let rotation_rad = match self.azimuth {
+            AzimuthSense::Ccw => -shift_rad,
+            AzimuthSense::Cw => shift_rad,
+        };
+        let rotation_rad = wrap_angle_rad(rotation_rad);
+        Some(VisualRotation { from_ns: from.stamp_ns, to_ns: to.stamp_ns, rotation_rad, quality })
+    }
+
+    /// The maximum of Σ Re(cross e^{i k s}) next to `start_rad`.
+    fn peak_near_rad(&self, start_rad: f64) -> f64 {
+        let column_rad = TAU / WIDE_COLUMNS as f64;
+        let mut shift_rad = start_rad;
+        for _ in 0..NEWTON_STEPS {
+            let (mut slope, mut bend) = (0.0, 0.0);
+            let step = Complex::from_polar(1.0, shift_rad);
+            let mut turn = Complex::from_polar(1.0, shift_rad * USED.start as f64);
+            for (k, cross) in USED.zip(&self.cross[USED]) {
+                let (k, value) = (k as f64, cross * turn);
+                slope -= k * value.im;
+                bend -= k * k * value.re;
+                turn *= step;
+            }
+            if bend >= 0.0 {
+                break;
+            }
+            shift_rad = (shift_rad - slope / bend).clamp(start_rad - column_rad, start_rad + column_rad);
+        }
+        if shift_rad > PI { shift_rad - TAU } else { shift_rad }
+    }
+}
+
+impl Profile {
+    fn zeros() -> Self {
+        Self { stamp_ns: 0, spectra: vec![Complex::ZERO; RINGS * USED.len()], energy: 0.0 }
+    }
+}
+
+const _: () = assert!(USED.end <= HARMONICS, "harmonics of a transform of WIDE_COLUMNS");
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    /// A landscape of harmonics, seen at a yaw; with noise.
+    fn seen(azimuth: AzimuthSense, yaw_rad: f64, noise: f32, seed: u64) -> Panorama {
+        let mut scene = ChaCha8Rng::seed_from_u64(7);
+        let waves: Vec<(f64, f64, f64)> =
+            (1..60).map(|k| (f64::from(k), scene.random_range(0.0..TAU), scene.random_range(0.0..12.0))).collect();
+        let sense = if azimuth == AzimuthSense::Ccw { 1.0 } else { -1.0 };
+        let row: Vec<f32> = (0..WIDE_COLUMNS)
+            .map(|j| {
+                let azimuth_rad = yaw_rad + sense * TAU * (j as f64 + 0.5) / WIDE_COLUMNS as f64;
+                waves.iter().map(|(k, phase, size)| size * (k * azimuth_rad + phase).cos()).sum::<f64>() as f32
+            })
+            .collect();
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let shade = |i: usize| 100.0 + row[i % WIDE_COLUMNS] + noise * rng.random_range(-1.0..1.0f32);
+        Panorama::from_wide((0..WIDE_COLUMNS * WIDE_ROWS).map(shade).collect())
+    }
+
+    #[test]
+    fn turns_of_any_size_are_found_to_a_fraction_of_a_column() {
+        for azimuth in [AzimuthSense::Ccw, AzimuthSense::Cw] {
+            let mut tracker = RotationTracker::new(azimuth);
+            assert_eq!(tracker.push(0, &seen(azimuth, 0.3, 30.0, 0)), None);
+            let mut yaw_rad = 0.3;
+            for (i, turn_rad) in [0.0, 0.001, 0.0123, -0.0123, 0.2, -1.0, 3.0, -0.005].into_iter().enumerate() {
+                yaw_rad += turn_rad;
+                let stamp_ns = i as u64 + 1;
+                let found = tracker.push(stamp_ns, &seen(azimuth, yaw_rad, 30.0, stamp_ns)).expect("clear");
+                assert_eq!((found.from_ns, found.to_ns), (stamp_ns - 1, stamp_ns));
+                // One column is 0.0123 rad.
+                assert!(wrap_angle_rad(found.rotation_rad - turn_rad).abs() < 2e-4, "{found:?}, truth {turn_rad}");
+                assert!((0.5..1.01).contains(&found.quality), "{found:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_does_not_show_a_turn_is_refused() {
+        let azimuth = AzimuthSense::Ccw;
+        let mut tracker = RotationTracker::new(azimuth);
+        let plain = Panorama::from_wide(vec![90.0; WIDE_COLUMNS * WIDE_ROWS]);
+        let noise = |seed| seen(azimuth, 0.0, 5000.0, seed);
+        tracker.push(0, &plain);
+        assert_eq!(tracker.push(1, &plain), None, "nothing to see");
+        assert_eq!(tracker.push(2, &seen(azimuth, 0.0, 1.0, 0)), None, "nothing before");
+        tracker.push(3, &noise(1));
+        assert_eq!(tracker.push(4, &noise(2)), None, "noise");
+        let striped = |j: usize| if (j / 8).is_multiple_of(2) { 50.0 } else { 150.0 };
+        let stripes = Panorama::from_wide((0..WIDE_COLUMNS * WIDE_ROWS).map(striped).collect());
+        tracker.push(5, &stripes);
+        assert_eq!(tracker.push(6, &stripes), None, "it could be any of 32 turns");
+        let broken = Panorama::from_wide(vec![f32::NAN; WIDE_COLUMNS * WIDE_ROWS]);
+        tracker.push(7, &broken);
+        assert_eq!(tracker.push(8, &broken), None);
+        tracker.push(9, &seen(azimuth, 0.0, 1.0, 0));
+        tracker.restart();
+        assert_eq!(tracker.push(10, &seen(azimuth, 0.0, 1.0, 0)), None, "told to begin anew");
+    }
+}
