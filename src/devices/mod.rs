@@ -22,7 +22,7 @@ use std::{
     time::Duration,
 };
 
-use crate::types::PooledBytes;
+use crate::types::{Clock, PooledBytes};
 
 /// What a camera does.
 #[derive(Debug)]
@@ -129,6 +129,17 @@ impl DeviceError {
             Self::Unsupported { .. } => "unsupported",
             Self::BadData { .. } => "bad data",
             Self::Io { .. } => "failed",
+        }
+    }
+}
+
+/// Waits for a stamp; `true` if told to stop before.
+pub fn wait_until(stamp_ns: u64, clock: &dyn Clock, stop: &Stop) -> bool {
+    loop {
+        match clock.until(stamp_ns) {
+            Duration::ZERO => return stop.is_stopped(),
+            left if stop.wait(left) => return true,
+            _ => {}
         }
     }
 }

@@ -56,3 +56,14 @@ fn hint(error: &io::Error) -> String {
         _ => error.to_string(),
     }
 }
+
+impl RecordingError {
+    /// The error of the MCAP writer as ours.
+    pub fn cannot_write(path: &std::path::Path, error: mcap::McapError) -> Self {
+        let cause = match error {
+            mcap::McapError::Io(cause) => cause,
+            other => std::io::Error::other(other),
+        };
+        Self::CannotWrite { path: path.into(), cause }
+    }
+}

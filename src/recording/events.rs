@@ -180,10 +180,10 @@ mod tests {
         let mut recording = RecordingWriter::new(Cursor::new(Vec::new())).expect("starts");
         let chunk = |baud| omniloc::SerialChunk { timestamp: None, data: vec![1, 2], baud };
         recording.write(&topics::GNSS_RAW, 0, 30, &chunk(1)).expect("writes");
-        recording.write_image(5, 20, vec![7]).expect("writes");
+        recording.write_image(5, 20, &[7]).expect("writes");
         recording.write(&topics::GNSS_PULSE, 0, 25, &omniloc::Pulse::default()).expect("writes");
         recording.write(&topics::GNSS_RAW, 0, 5 * NS_PER_S, &chunk(2)).expect("writes");
-        recording.write_image(6, 4 * NS_PER_S, vec![8]).expect("writes");
+        recording.write_image(6, 4 * NS_PER_S, &[8]).expect("writes");
         fs::write(&path, recording.finish().expect("finishes").into_inner()).expect("writes");
 
         let records: Result<Vec<_>, _> = DeviceRecords::open(&path).expect("opens").collect();

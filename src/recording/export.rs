@@ -9,11 +9,11 @@ use std::{
 use serde_json::json;
 
 use super::{
+    atomic::{folder_of, sync_folder, write_file_atomically},
     dataset::{CALIBRATION_FILE, IMAGES_FOLDER, POSITIONS_FILE, RECORDING_FILE, RecordingFacts},
     error::RecordingError,
     positions::{HEADER, image_path},
     reader::{Recording, SurveyFrame},
-    writer::{folder_of, sync_folder, write_file_atomically},
 };
 use crate::types::{Geodetic, LocalFrame};
 

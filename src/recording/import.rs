@@ -8,12 +8,13 @@ use std::{
 };
 
 use super::{
+    atomic::write_file_atomically,
     dataset::{CALIBRATION_FILE, Dataset, DatasetError, IMAGES_FOLDER},
     error::RecordingError,
     positions::Row,
     proto::{foxglove, omniloc},
     topics::{self, metadata},
-    writer::{RecordingWriter, timestamp, write_file_atomically},
+    writer::{RecordingWriter, timestamp},
 };
 use crate::{
     jpeg::{self, JpegInfo},
@@ -66,7 +67,7 @@ pub fn import(settings: &ImportSettings, out: &Path) -> Result<ImportReport, Dat
 
     let mut completed_frames = 0;
     write_file_atomically(out, |file| {
-        let failed = |error| write_error(out, error);
+        let failed = |error| DatasetError::from(RecordingError::cannot_write(out, error));
         let mut recording = RecordingWriter::new(file).map_err(failed)?;
         write_head(&mut recording, &dataset, image_size_px, calibration_json.as_deref(), origin).map_err(failed)?;
         let local_frame = origin.map(LocalFrame::new);
@@ -85,14 +86,6 @@ pub fn import(settings: &ImportSettings, out: &Path) -> Result<ImportReport, Dat
 
     let frames = dataset.rows.len();
     Ok(ImportReport { name: dataset.name, frames, image_size_px, completed_frames, warnings: dataset.warnings })
-}
-
-fn write_error(out: &Path, error: mcap::McapError) -> DatasetError {
-    let cause = match error {
-        mcap::McapError::Io(cause) => cause,
-        other => std::io::Error::other(other),
-    };
-    RecordingError::CannotWrite { path: out.into(), cause }.into()
 }
 
 /// The stamp of a frame \[ns\]: its time, or, in a data set without times, one second a frame.

@@ -4,6 +4,7 @@
 //! linked by the frame's sequence number. Positions are metres east and north from the recording's origin; where that
 //! origin lies on the Earth may be unknown.
 
+mod atomic;
 mod dataset;
 mod error;
 mod events;
@@ -20,6 +21,7 @@ pub mod topics;
 mod verify;
 mod writer;
 
+pub use atomic::{write_bytes_atomically, write_file_atomically};
 pub use dataset::{Dataset, DatasetError};
 pub use error::RecordingError;
 pub use events::{DeviceRecord, DeviceRecords, TimedRecord};
@@ -27,4 +29,4 @@ pub use export::{ExportError, ExportReport, Format, export};
 pub use import::{CalibrationSource, ImportReport, ImportSettings, import};
 pub use reader::{Frames, Recording, SurveyFrame, TopicSummary};
 pub use verify::{Verdict, verify};
-pub use writer::{RecordingWriter, write_bytes_atomically, write_file_atomically};
+pub use writer::RecordingWriter;

@@ -145,6 +145,11 @@ impl Recording {
         });
     }
 
+    /// The attachment `donut.json` as it was written.
+    pub fn calibration_json(&self) -> Option<&[u8]> {
+        self.calibration_json.as_deref()
+    }
+
     /// The usable frames with their images, in the order of [`survey`](Self::survey); reads the file again.
     pub fn frames(&self) -> Result<Frames, RecordingError> {
         Ok(Frames {

@@ -2,16 +2,13 @@
 
 use std::{
     collections::BTreeMap,
-    fs::{self, File},
-    io::{self, BufWriter, Seek, Write},
-    path::Path,
+    io::{Seek, Write},
 };
 
 use mcap::{Attachment, McapError, WriteOptions, Writer, records::MessageHeader, records::Metadata};
 use prost::Message;
 
 use super::{
-    error::RecordingError,
     proto::{foxglove, omniloc},
     topics::{self, Topic},
 };
@@ -201,53 +198,9 @@ pub(super) fn timestamp(stamp_ns: u64) -> prost_types::Timestamp {
     prost_types::Timestamp { seconds: (stamp_ns / 1_000_000_000) as i64, nanos: (stamp_ns % 1_000_000_000) as i32 }
 }
 
-/// Writes a file under a temporary name in its own folder, and gives it its name only when it is whole and on the disk.
-///
-/// # Errors
-/// What `write` returns, or that the folder cannot be written to. The target is then as it was before.
-pub fn write_file_atomically<E: From<RecordingError>>(
-    path: &Path,
-    write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
-) -> Result<(), E> {
-    let folder = folder_of(path);
-    let failed = |cause: io::Error| RecordingError::CannotWrite { path: path.into(), cause };
-
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".omniloc-").suffix(".tmp");
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666)); // the umask still applies
-    let temporary = builder.tempfile_in(folder).map_err(failed)?;
-
-    let (file, temporary_path) = temporary.into_parts();
-    let mut out = BufWriter::with_capacity(1 << 20, file);
-    write(&mut out)?;
-    let file = out.into_inner().map_err(|error| failed(error.into_error()))?;
-    file.sync_all().map_err(failed)?;
-    temporary_path.persist(path).map_err(|error| failed(error.error))?;
-    sync_folder(folder);
-    Ok(())
-}
-
-/// [`write_file_atomically`] of bytes that are there already.
-pub fn write_bytes_atomically(path: &Path, bytes: &[u8]) -> Result<(), RecordingError> {
-    write_file_atomically(path, |out| {
-        out.write_all(bytes).map_err(|cause| RecordingError::CannotWrite { path: path.into(), cause })
-    })
-}
-
-/// The folder that holds `path`.
-pub(super) fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
-/// Makes a rename last through a power cut. Some file systems cannot sync a folder; the file itself is safe already.
-pub(super) fn sync_folder(folder: &Path) {
-    let _ = fs::File::open(folder).and_then(|folder| folder.sync_all());
-}
-
 #[cfg(test)]
 mod tests {
-    use std::io::Cursor;
+    use std::io::{self, Cursor};
 
     use super::*;
 
@@ -323,21 +276,5 @@ mod tests {
         recording.write_pair(3, 5_000_000_000, omniloc::SurveyPair::default()).expect("writes");
         let bytes = recording.finish().expect("finishes").into_inner();
         assert_eq!(times(&bytes), (1_700_000_005_000_000_001, 5_000_000_000, 1_700_000_005_000_000_001));
-    }
-
-    #[test]
-    fn a_failed_write_leaves_the_old_file_and_nothing_else() {
-        let folder = tempfile::tempdir().expect("a temporary folder");
-        let path = folder.path().join("a.mcap");
-        fs::write(&path, "old").expect("writes");
-        let full = |out: &mut BufWriter<File>| {
-            out.write_all(b"half a recording").expect("writes");
-            let cause = io::ErrorKind::StorageFull.into();
-            Err(RecordingError::CannotWrite { path: path.clone(), cause })
-        };
-        let message = write_file_atomically(&path, full).expect_err("it fails").to_string();
-        assert!(message.contains("a.mcap: cannot write: the disk is full"), "{message}");
-        assert_eq!(fs::read(&path).expect("readable"), b"old");
-        assert_eq!(fs::read_dir(folder.path()).expect("readable").count(), 1);
     }
 }

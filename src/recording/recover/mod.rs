@@ -22,11 +22,11 @@ use std::{
 use mcap::{McapError, WriteOptions, Writer, records::MessageHeader};
 
 use super::{
+    atomic::write_file_atomically,
     error::RecordingError,
     reader::TopicSummary,
     topics::metadata,
     verify::{Verdict, verify},
-    writer::write_file_atomically,
 };
 
 /// A part of the file that could not be used.
