@@ -11,6 +11,10 @@
 //! never blocks. A device decides nothing about what its values mean: bytes of the serial line are decoded, checked and
 //! paired elsewhere, so that a replayed drive takes the same way as a live one.
 
+pub mod gnss_serial;
+pub mod pty;
+mod rate_hunt;
+
 use std::{
     path::PathBuf,
     sync::{Arc, Condvar, Mutex, PoisonError},
