@@ -15,6 +15,9 @@ pub mod camera_v4l2;
 
 pub mod mjpeg;
 pub mod yuyv;
+pub mod gnss_serial;
+pub mod pty;
+mod rate_hunt;
 
 use std::{
     path::PathBuf,
