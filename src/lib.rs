@@ -29,6 +29,7 @@
 //! | [`train`] | recordings → map: recipes, splits, selection |
 //! | [`metrics`] | error figures of position estimates |
 //! | [`evaluate`] | the protocol's results and the paper's tables |
+//! | [`world`] | simulated places, drives and receivers |
 //! | [`commands`] | the program: one file a command |
 //!
 //! # Frames and units
@@ -56,3 +57,4 @@ pub mod recording;
 pub mod sync;
 pub mod train;
 pub mod types;
+pub mod world;

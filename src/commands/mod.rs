@@ -14,6 +14,7 @@ pub mod man;
 pub mod map_report;
 pub mod options;
 pub mod progress;
+pub mod simulate;
 pub mod survey;
 pub mod train;
 
@@ -50,6 +51,7 @@ pub enum Command {
     Train(train::Args),
     Evaluate(evaluate::Args),
     Export(export::Args),
+    Simulate(simulate::Args),
     Info(info::Args),
     Check(check::Args),
     Completions(completions::Args),
@@ -65,6 +67,7 @@ impl Command {
             Self::Train(args) => train::run(args),
             Self::Evaluate(args) => evaluate::run(args),
             Self::Export(args) => export::run(args),
+            Self::Simulate(args) => simulate::run(args),
             Self::Info(args) => info::run(args),
             Self::Check(args) => check::run(args),
             Self::Completions(args) => completions::run(args, Cli::command()),
