@@ -23,7 +23,7 @@
 //! | gap in the sequence numbers | `Lost` "skipped by the camera" | |
 //! | EIO when dequeuing | `Lost` "read error", goes on | |
 //! | sequence numbers start again | nothing is lost; ours go on | |
-//! | stamp of another clock, not rising, or far off | `Frame` stamped with its arrival; said once | |
+//! | stamp of another clock, not rising, or far off | `Frame` stamped by its arrival; said once | |
 //! | nothing usable for `frame_timeout_ms` | | `TimedOut`: silent |
 //! | unplugged (ENODEV, POLLERR, POLLHUP) | | `Disconnected`: disconnected |
 //! | anything else the driver says | | `Io`: failed |

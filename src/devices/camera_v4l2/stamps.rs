@@ -2,7 +2,8 @@
 //!
 //! `uvcvideo` stamps the start of the exposure on the monotonic clock, from the camera's own clock where the camera
 //! sends it; cameras exist whose clock makes stamps jump back or ahead. A stamp that cannot be right is replaced by the
-//! time of arrival, which is late by exposure, readout and transfer.
+//! time of arrival, less the least delay that good stamps have shown: exposure, readout and transfer. If there was no
+//! good one, nothing is known of the delay and nothing is subtracted.
 
 use tracing::{info, warn};
 
@@ -24,8 +25,12 @@ const MAX_AGE_NS: u64 = 1_000_000_000;
 pub struct StampJudge {
     /// Frames the driver can hold while nobody fetches them.
     buffers: u32,
-    last_stamp_ns: u64,
+    last_ns: u64,
+    /// The last one of the driver that was believed.
+    last_driver_ns: u64,
     last_arrival_ns: Option<u64>,
+    /// Least delay from a believed stamp to the arrival.
+    delay_ns: Option<u64>,
     /// After we came late, so many buffers may be as much older.
     late_ns: u64,
     late_buffers: u32,
@@ -37,8 +42,10 @@ impl StampJudge {
     pub fn new(buffers: u32) -> Self {
         Self {
             buffers,
-            last_stamp_ns: 0,
+            last_ns: 0,
+            last_driver_ns: 0,
             last_arrival_ns: None,
+            delay_ns: None,
             late_ns: 0,
             late_buffers: 0,
             rejected: 0,
@@ -51,7 +58,7 @@ impl StampJudge {
         self.rejected
     }
 
-    /// The stamp of a frame that was fetched at `arrival_ns`. Stamps rise strictly if arrivals do.
+    /// The stamp of a frame that was fetched at `arrival_ns`. Stamps rise strictly.
     pub fn stamp_ns(&mut self, stamp: DriverStamp, arrival_ns: u64) -> u64 {
         let waited_ns = arrival_ns.saturating_sub(self.last_arrival_ns.unwrap_or(arrival_ns));
         self.last_arrival_ns = Some(arrival_ns);
@@ -62,13 +69,20 @@ impl StampJudge {
         self.late_buffers = self.late_buffers.saturating_sub(1);
 
         let plausible = stamp.monotonic
-            && stamp.ns > self.last_stamp_ns
+            && stamp.ns > self.last_driver_ns
             && stamp.ns <= arrival_ns
             && arrival_ns - stamp.ns <= max_age_ns;
         self.tell(stamp, plausible, arrival_ns);
-        let chosen_ns = if plausible { stamp.ns } else { arrival_ns.max(self.last_stamp_ns + 1) };
-        self.last_stamp_ns = chosen_ns;
-        chosen_ns
+        let best_ns = if plausible {
+            let age_ns = arrival_ns - stamp.ns;
+            self.last_driver_ns = stamp.ns;
+            self.delay_ns = Some(self.delay_ns.map_or(age_ns, |least_ns| least_ns.min(age_ns)));
+            stamp.ns
+        } else {
+            arrival_ns.saturating_sub(self.delay_ns.unwrap_or(0))
+        };
+        self.last_ns = best_ns.max(self.last_ns + 1);
+        self.last_ns
     }
 
     fn tell(&mut self, stamp: DriverStamp, plausible: bool, arrival_ns: u64) {
@@ -78,9 +92,9 @@ impl StampJudge {
                 warn!(
                     stamp_ns = stamp.ns,
                     arrival_ns,
-                    last_stamp_ns = self.last_stamp_ns,
+                    last_stamp_ns = self.last_driver_ns,
                     monotonic = stamp.monotonic,
-                    "the camera driver's stamps cannot be right; such frames are stamped with their arrival"
+                    "the camera driver's stamps cannot be right; such frames are stamped by their arrival"
                 );
             }
         } else if !self.source_told {
@@ -148,27 +162,43 @@ mod tests {
     }
 
     #[test]
-    fn stamps_that_cannot_be_right_become_the_arrival() {
+    fn stamps_that_cannot_be_right_become_the_arrival_less_the_delay() {
+        let delay_ns = 45 * MS;
         let arrival_ns = 10_000 * MS;
+        let earlier = monotonic(arrival_ns - 33 * MS - delay_ns);
         let realtime = DriverStamp { ns: 1_700_000_000_000 * MS, monotonic: false, start_of_exposure: true };
         for (name, wrong) in [
             ("another clock", realtime),
             ("another clock that looks right", DriverStamp { monotonic: false, ..monotonic(arrival_ns - MS) }),
-            ("the same again", monotonic(arrival_ns - 78 * MS)),
-            ("earlier", monotonic(arrival_ns - 100 * MS)),
+            ("the same again", earlier),
+            ("earlier", monotonic(earlier.ns - MS)),
             ("zero", monotonic(0)),
             ("the future", monotonic(arrival_ns + MS)),
             ("the far future", monotonic(u64::MAX)),
         ] {
             let mut judge = StampJudge::new(6);
-            judge.stamp_ns(monotonic(arrival_ns - 78 * MS), arrival_ns - 33 * MS);
-            assert_eq!(judge.stamp_ns(wrong, arrival_ns), arrival_ns, "{name}");
+            judge.stamp_ns(earlier, arrival_ns - 33 * MS);
+            assert_eq!(judge.stamp_ns(wrong, arrival_ns), arrival_ns - delay_ns, "{name}");
             assert_eq!(judge.rejected(), 1, "{name}");
-            let next_ns = arrival_ns + 40 * MS;
-            assert_eq!(judge.stamp_ns(monotonic(next_ns), next_ns + MS), next_ns, "{name}: goes on");
+            let next = monotonic(arrival_ns + 33 * MS - delay_ns);
+            assert_eq!(judge.stamp_ns(next, arrival_ns + 33 * MS), next.ns, "{name}: the next is believed again");
         }
         let mut judge = StampJudge::new(6);
-        assert_eq!(judge.stamp_ns(monotonic(arrival_ns - 3000 * MS), arrival_ns), arrival_ns, "old from the start");
+        let old = monotonic(arrival_ns - 3000 * MS);
+        assert_eq!(judge.stamp_ns(old, arrival_ns), arrival_ns, "of the delay nothing is known yet");
+    }
+
+    #[test]
+    fn a_replaced_stamp_that_is_late_holds_up_no_good_ones() {
+        let mut judge = StampJudge::new(6);
+        // Nothing is known of the delay, so that the first one is 45 ms late: more than the period.
+        assert_eq!(judge.stamp_ns(monotonic(0), 1045 * MS), 1045 * MS);
+        for frame in 1..10 {
+            let stamp_ns = (1000 + frame * 16) * MS;
+            let found_ns = judge.stamp_ns(monotonic(stamp_ns), stamp_ns + 45 * MS);
+            assert!(found_ns == stamp_ns || found_ns <= 1045 * MS + frame, "{frame}: {found_ns}");
+        }
+        assert_eq!(judge.rejected(), 1);
     }
 
     #[test]
