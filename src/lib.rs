@@ -18,6 +18,7 @@
 //! | [`types`] | words every folder may use: positions, calibration, images |
 //! | [`devices`] | hardware in, stamped values out |
 //! | [`recording`] | MCAP on disk; import and export of image folders |
+//! | [`gnss`] | bytes of the serial line → positions, yaws, times |
 //! | [`sync`] | where the vehicle was when a frame was exposed |
 //! | [`jpeg`] | JPEG in, luma out |
 //! | [`calibrate`] | finds the donut in the image |
@@ -30,6 +31,8 @@
 //! | [`metrics`] | error figures of position estimates |
 //! | [`evaluate`] | the protocol's results and the paper's tables |
 //! | [`world`] | simulated places, drives and receivers |
+//! | [`config`] | one TOML file → the settings that the modules own |
+//! | [`runtime`] | which task feeds which; keeps devices running; starts and stops |
 //! | [`commands`] | the program: one file a command |
 //!
 //! # Frames and units
@@ -41,6 +44,7 @@
 
 pub mod calibrate;
 pub mod commands;
+pub mod config;
 pub mod devices;
 pub mod evaluate;
 pub mod features;
@@ -54,6 +58,7 @@ pub mod map;
 pub mod metrics;
 pub mod panorama;
 pub mod recording;
+pub mod runtime;
 pub mod sync;
 pub mod train;
 pub mod types;

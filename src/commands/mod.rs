@@ -10,10 +10,14 @@ pub mod file_kind;
 pub mod frame_source;
 pub mod import;
 pub mod info;
+pub mod journal;
 pub mod man;
 pub mod map_report;
+pub mod mark;
 pub mod options;
 pub mod progress;
+pub mod record;
+pub mod replay;
 pub mod simulate;
 pub mod survey;
 pub mod train;
@@ -31,6 +35,8 @@ pub const DONE: u8 = 0;
 pub const FAILED: u8 = 1;
 /// Bad arguments or a bad configuration file.
 pub const BAD_ARGUMENTS: u8 = 2;
+/// Done, but data was lost.
+pub const DATA_LOST: u8 = 3;
 
 /// Tells a vehicle where it is from one omnidirectional camera
 ///
@@ -46,6 +52,9 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     Demo(demo::Args),
+    Record(record::Args),
+    Mark(mark::Args),
+    Replay(replay::Args),
     Import(import::Args),
     Calibrate(calibrate::CalibrateArgs),
     Train(train::Args),
@@ -62,6 +71,9 @@ impl Command {
     pub fn run(&self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Demo(args) => demo::run(args),
+            Self::Record(args) => record::run(args),
+            Self::Mark(args) => mark::run(args),
+            Self::Replay(args) => replay::run(args),
             Self::Import(args) => import::run(args),
             Self::Calibrate(args) => calibrate::run(args),
             Self::Train(args) => train::run(args),

@@ -153,9 +153,8 @@ fn what_is_no_serial_port_is_refused() {
 #[test]
 fn bytes_that_nobody_reads_are_lost_at_a_clocks_pace() {
     let pty = Pty::open(None).expect("a pseudo-terminal");
-    let pace = Pace::Clock { origin_ns: 0, clock_origin_ns: 0, speed: 1.0 };
     let bytes = [TimedBytes { at_ns: 0, bytes: lines(0..1) }];
-    let played = pty.play(bytes, pace, &SystemClock, &Stop::default()).expect("plays");
+    let played = pty.play(bytes, Pace::Clock, &SystemClock, &Stop::default()).expect("plays");
     assert_eq!(played, Played { written_bytes: 0, lost_bytes: lines(0..1).len() as u64 });
 }
 

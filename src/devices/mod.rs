@@ -12,12 +12,14 @@
 //! paired elsewhere, so that a replayed drive takes the same way as a live one.
 
 pub mod camera_v4l2;
-
-pub mod mjpeg;
-pub mod yuyv;
 pub mod gnss_serial;
+pub mod gpio;
+pub mod mjpeg;
 pub mod pty;
 mod rate_hunt;
+pub mod replay;
+pub mod simulated;
+pub mod yuyv;
 
 use std::{
     path::PathBuf,

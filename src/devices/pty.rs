@@ -18,7 +18,7 @@ use rustix::{
     termios::{OptionalActions, tcgetattr, tcsetattr},
 };
 
-use super::Stop;
+use super::{Stop, wait_until};
 use crate::types::Clock;
 
 /// Bytes, and when the last of them is on the line.
@@ -30,25 +30,12 @@ pub struct TimedBytes {
 }
 
 /// How time goes by in a simulation or a replay.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pace {
-    /// As time goes by, times `speed`: what is due at `origin_ns` comes when the clock says `clock_origin_ns`.
-    Clock { origin_ns: u64, clock_origin_ns: u64, speed: f64 },
-    /// As fast as it is read.
+    /// Bytes are written when the clock says that they are due.
+    Clock,
+    /// As fast as they are read.
     AsRead,
-}
-
-impl Pace {
-    /// What the clock says when something is due; None: now.
-    fn due_ns(&self, at_ns: u64) -> Option<u64> {
-        match *self {
-            Self::Clock { origin_ns, clock_origin_ns, speed } => {
-                let after_ns = at_ns.saturating_sub(origin_ns) as f64 / speed;
-                Some(clock_origin_ns.saturating_add(after_ns as u64))
-            }
-            Self::AsRead => None,
-        }
-    }
 }
 
 /// One end of a pseudo-terminal. Dropping it is unplugging the device.
@@ -116,11 +103,8 @@ impl Pty {
     ) -> io::Result<Played> {
         let mut played = Played::default();
         for TimedBytes { at_ns, bytes } in bytes {
-            if let Some(due_ns) = pace.due_ns(at_ns) {
-                let wait_ns = due_ns.saturating_sub(clock.monotonic_ns());
-                if stop.wait(Duration::from_nanos(wait_ns)) {
-                    break;
-                }
+            if pace == Pace::Clock && wait_until(at_ns, clock, stop) {
+                break;
             }
             let written = self.write(&bytes, pace == Pace::AsRead, stop)?;
             played.written_bytes += written as u64;
@@ -241,14 +225,5 @@ mod tests {
             assert_ne!(received_at_rate(&bytes, baud, baud / 2), bytes);
             assert_ne!(received_at_rate(&bytes, baud, baud * 2), bytes);
         }
-    }
-
-    #[test]
-    fn bytes_are_due_at_their_time_divided_by_the_speed() {
-        let pace = Pace::Clock { origin_ns: 1_000, clock_origin_ns: 50_000, speed: 4.0 };
-        assert_eq!(pace.due_ns(1_000), Some(50_000));
-        assert_eq!(pace.due_ns(9_000), Some(52_000));
-        assert_eq!(pace.due_ns(0), Some(50_000));
-        assert_eq!(Pace::AsRead.due_ns(9_000), None);
     }
 }

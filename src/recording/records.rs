@@ -29,7 +29,7 @@ const FOOTER_CRC_COVERS: usize = 16;
 /// A file being read record by record.
 pub(super) struct RecordFile {
     path: PathBuf,
-    reader: BufReader<Box<dyn Read>>,
+    reader: BufReader<Box<dyn Read + Send>>,
     size: u64,
     /// Of the next record.
     offset: u64,
@@ -61,7 +61,7 @@ impl RecordFile {
     }
 
     /// A recording of `size` bytes, which messages call `path`.
-    pub fn from_reader(path: &Path, reader: Box<dyn Read>, size: u64) -> Result<Self, RecordingError> {
+    pub fn from_reader(path: &Path, reader: Box<dyn Read + Send>, size: u64) -> Result<Self, RecordingError> {
         let failed = |source| RecordingError::CannotRead { path: path.into(), source };
         let mut reader = BufReader::with_capacity(1 << 20, reader);
         let mut start = Vec::new();

@@ -1,0 +1,318 @@
+//! From a configuration to a drive: which device, which clock, which disk. The only place that knows them all.
+
+use std::{fs, path::Path, sync::Arc, thread::JoinHandle, time::Duration};
+
+use anyhow::Context;
+
+pub use super::live::DriveReport;
+use super::live::{self, DeviceRun, Devices, DriveSettings};
+use crate::{
+    config::{Camera, Gnss, RecordConfig},
+    devices::{
+        CameraEvent, CameraFacts, GpioEvent, SerialEvent, Stop, camera_v4l2, gnss_serial,
+        gpio::{self, Led, SimulatedPins},
+        pty::{Pace, Pty, TimedBytes},
+        replay::{self, ReplayCamera},
+        simulated::{DATE_STEP_NS, FaultKind, Simulation},
+    },
+    recording::{
+        DeviceRecord, DeviceRecords, Recording,
+        proto::omniloc,
+        recorder::{Folder, Head, Recorder},
+        topics,
+    },
+    types::{Clock, ClockReading, DonutCalibration, NS_PER_S, ScaledClock, SystemClock},
+};
+
+/// Where the clocks of a simulated drive start: a computer that was switched on a while ago.
+const SIMULATED_START: ClockReading =
+    ClockReading { monotonic_ns: 100 * NS_PER_S, realtime_ns: 1_790_000_000 * NS_PER_S as i64 };
+/// A simulated drive begins so long after the clocks start: the time that everything needs to be ready [ns of the clock].
+const SIMULATED_LEAD_NS: u64 = NS_PER_S / 2;
+
+/// Records a drive as `config` says, until it is told to stop or its devices end; `each_second` is told the status.
+pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) -> anyhow::Result<DriveReport> {
+    let world = config.simulation.as_ref().map(|settings| settings.world());
+    let start = match (&config.simulation, replayed(config)) {
+        (Some(_), _) => Some(SIMULATED_START),
+        (None, Some(path)) => Some(first_clocks(path)?),
+        (None, None) => None,
+    };
+    let speed = config.simulation.as_ref().map_or(1.0, |simulation| simulation.speed) * config.replay_speed;
+    let mut calibration = config.vehicle.calibration.as_deref().map(read_calibration).transpose()?;
+    if let (None, Some(path)) = (&calibration, replayed(config)) {
+        calibration = Recording::open_any(path)?.calibration_json().map(<[u8]>::to_vec);
+    }
+    let simulation = match (&config.simulation, &world) {
+        (Some(settings), Some(world)) => {
+            calibration.get_or_insert_with(|| calibration_json(&settings.camera().donut));
+            let start_ns = SIMULATED_START.monotonic_ns + (SIMULATED_LEAD_NS as f64 * speed.max(1.0)) as u64;
+            Some((Simulation::new(settings, world, start_ns, SIMULATED_START.realtime_ns), world))
+        }
+        _ => None,
+    };
+
+    // A camera renders its world first, which takes a while: the clocks start when it is ready.
+    let mut camera = simulated_camera(config, simulation.as_ref())?;
+    let clock: Arc<dyn Clock> = match start {
+        Some(start) => Arc::new(scaled_clock(start, speed, simulation.as_ref().map(|(simulation, _)| simulation))),
+        None => Arc::new(SystemClock),
+    };
+
+    let boot_id = boot_id();
+    let mut head = Head::new(&config.resolved(), &config.vehicle.name, &boot_id, clock.read());
+    head.calibration_json = calibration;
+    let log_offset_ns = head.log_offset_ns;
+    let storage = Folder::new(&config.recorder.folder)
+        .with_context(|| format!("making the folder {}", config.recorder.folder.display()))?;
+    let recorder = Recorder::start(config.recorder.clone(), head, &boot_id, Arc::new(storage), clock.clone())?;
+
+    let ports = tempfile::tempdir().context("making a folder for pseudo-terminals")?;
+    let stop = Stop::default();
+    let (gnss, player) = gnss(config, simulation.as_ref(), ports.path(), &clock, &stop)?;
+    let led = Led::default();
+    let devices = Devices {
+        camera: match camera.take() {
+            Some(camera) => Some(camera),
+            None => real_or_replayed_camera(config)?,
+        },
+        gnss,
+        gpio: pins(config, simulation.as_ref().map(|(simulation, _)| simulation), &led)?,
+    };
+    let settings = DriveSettings {
+        decoder: config.decoder.clone(),
+        sync: config.sync.clone(),
+        log_offset_ns,
+        second: Duration::from_secs_f64(1.0 / speed),
+        folder: config.recorder.folder.clone(),
+        led,
+    };
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("starting the runtime")?;
+    let report = runtime.block_on(live::run(settings, devices, recorder, clock, each_second));
+    stop.stop();
+    if let Some(player) = player {
+        let _ = player.join();
+    }
+    report
+}
+
+fn simulated_camera(
+    config: &RecordConfig,
+    simulation: Option<&(Simulation, &crate::world::World)>,
+) -> anyhow::Result<Option<DeviceRun<CameraEvent>>> {
+    let (Camera::Simulated, Some((simulation, world))) = (&config.camera, simulation) else { return Ok(None) };
+    let mut camera = simulation.camera(world)?;
+    Ok(Some(Box::new(move |clock, stop, emit| camera.run(clock, stop, emit))))
+}
+
+fn real_or_replayed_camera(config: &RecordConfig) -> anyhow::Result<Option<DeviceRun<CameraEvent>>> {
+    Ok(match &config.camera {
+        Camera::V4l2(settings) => {
+            let settings = settings.clone();
+            Some(Box::new(move |clock, stop, emit| camera_v4l2::run(&settings, clock, stop, emit)))
+        }
+        Camera::Replay(replay) => {
+            let mut camera = ReplayCamera::open(&replay.recording, camera_facts(&replay.recording)?)?;
+            Some(Box::new(move |clock, stop, emit| camera.run(clock, stop, emit)))
+        }
+        Camera::Simulated | Camera::None => None,
+    })
+}
+
+/// The serial line, and the thread that plays a simulated or replayed receiver into it.
+fn gnss(
+    config: &RecordConfig,
+    simulation: Option<&(Simulation, &crate::world::World)>,
+    ports: &Path,
+    clock: &Arc<dyn Clock>,
+    stop: &Stop,
+) -> anyhow::Result<(Option<DeviceRun<SerialEvent>>, Option<JoinHandle<()>>)> {
+    let link = ports.join("receiver");
+    let play = |bytes, unplugged_ns| play(bytes, unplugged_ns, &link, clock, stop);
+    let player = match (&config.gnss, simulation) {
+        (Gnss::None, _) => return Ok((None, None)),
+        (Gnss::Serial(settings), _) => {
+            let settings = settings.clone();
+            return Ok((Some(Box::new(move |clock, stop, emit| gnss_serial::run(&settings, clock, stop, emit))), None));
+        }
+        (Gnss::Replay(replay), _) => play(Box::new(replay::serial_bytes(&replay.recording)?), Vec::new())?,
+        (Gnss::Simulated, Some((simulation, world))) => {
+            let unplugged_ns = simulation.intervals_ns(FaultKind::ReceiverUnplugged).collect();
+            play(Box::new(simulation.receiver(world)), unplugged_ns)?
+        }
+        (Gnss::Simulated, None) => unreachable!("a simulated driver needs [simulation]: checked when it was loaded"),
+    };
+    let settings = gnss_serial::Settings {
+        port: link,
+        baud: gnss_serial::Baud::Fixed(SIMULATED_BAUD),
+        silence_timeout_s: SIMULATED_SILENCE_S,
+    };
+    let ended = player.ended.clone();
+    let run: DeviceRun<SerialEvent> = Box::new(move |clock, stop, emit| {
+        let outcome = gnss_serial::run(&settings, clock, stop, emit);
+        // At the end of the drive the line is taken away, and that is not a fault.
+        if ended.is_stopped() { Ok(()) } else { outcome }
+    });
+    Ok((Some(run), Some(player.thread)))
+}
+
+/// Speed that a pseudo-terminal pretends to have.
+const SIMULATED_BAUD: u32 = 115_200;
+/// As for a real receiver.
+const SIMULATED_SILENCE_S: f64 = 3.0;
+
+struct Player {
+    thread: JoinHandle<()>,
+    /// Everything was played.
+    ended: Stop,
+}
+
+/// Plays bytes into a pseudo-terminal called `link`, which is away while the receiver is unplugged.
+fn play(
+    bytes: Box<dyn Iterator<Item = TimedBytes> + Send>,
+    unplugged_ns: Vec<std::ops::Range<u64>>,
+    link: &Path,
+    clock: &Arc<dyn Clock>,
+    stop: &Stop,
+) -> anyhow::Result<Player> {
+    let ended = Stop::default();
+    let mut pty = Some(Pty::open(Some(link)).context("opening a pseudo-terminal")?);
+    let (link, clock, stop, end) = (link.to_owned(), clock.clone(), stop.clone(), ended.clone());
+    let thread = std::thread::Builder::new().name("receiver".into()).spawn(move || {
+        let mut bytes = bytes.peekable();
+        while let Some(next) = bytes.peek() {
+            let unplugged = unplugged_ns.iter().find(|interval| interval.contains(&next.at_ns)).cloned();
+            if let Some(interval) = unplugged {
+                crate::devices::wait_until(interval.start, &*clock, &stop);
+                pty = None;
+                crate::devices::wait_until(interval.end, &*clock, &stop);
+                while bytes.next_if(|next| interval.contains(&next.at_ns)).is_some() {}
+            }
+            if stop.is_stopped() {
+                break;
+            }
+            let plugged = match pty.take() {
+                Some(plugged) => plugged,
+                None => match Pty::open(Some(&link)) {
+                    Ok(plugged) => plugged,
+                    Err(error) => {
+                        tracing::error!(%error, "the simulated receiver has no pseudo-terminal");
+                        break;
+                    }
+                },
+            };
+            let until_unplugged = |next: &TimedBytes| !unplugged_ns.iter().any(|gone| gone.contains(&next.at_ns));
+            let piece = std::iter::from_fn(|| bytes.next_if(until_unplugged));
+            if let Err(error) = plugged.play(piece, Pace::Clock, &*clock, &stop) {
+                tracing::error!(%error, "the simulated receiver failed");
+                break;
+            }
+            pty = Some(plugged);
+        }
+        end.stop();
+        // Dropped here: the driver sees that the line is gone.
+        drop(pty);
+    });
+    Ok(Player { thread: thread.context("starting the thread of the receiver")?, ended })
+}
+
+/// The pins; simulated and replayed pulses need no configuration.
+fn pins(
+    config: &RecordConfig,
+    simulation: Option<&Simulation>,
+    led: &Led,
+) -> anyhow::Result<Option<DeviceRun<GpioEvent>>> {
+    let mut settings = config.gpio.clone();
+    let pins = match (&config.gnss, simulation) {
+        (Gnss::Simulated, Some(simulation)) => SimulatedPins::new(simulation.pulses()),
+        (Gnss::Replay(replay), _) => SimulatedPins::new(replay::pulses(&replay.recording)?),
+        _ if settings.driver == gpio::Driver::None => return Ok(None),
+        _ => SimulatedPins::default(),
+    };
+    if settings.driver == gpio::Driver::None {
+        settings.driver = gpio::Driver::Simulated;
+    }
+    let led = led.clone();
+    Ok(Some(Box::new(move |clock, stop, emit| gpio::run(&settings, &led, &pins, clock, stop, emit))))
+}
+
+/// The recording that is played instead of a device.
+fn replayed(config: &RecordConfig) -> Option<&Path> {
+    match (&config.camera, &config.gnss) {
+        (Camera::Replay(replay), _) | (_, Gnss::Replay(replay)) => Some(&replay.recording),
+        _ => None,
+    }
+}
+
+/// What the clocks said a little before the first thing in a recording.
+pub fn first_clocks(path: &Path) -> anyhow::Result<ClockReading> {
+    const LEAD_NS: u64 = NS_PER_S / 10;
+    let first = DeviceRecords::open(path)?.next();
+    let first = first.with_context(|| format!("{}: nothing in it can be replayed", path.display()))??;
+    let offset_ns = match first.record {
+        DeviceRecord::Clock(clocks) => clocks.realtime_ns - clocks.monotonic_ns as i64,
+        _ => log_offset_ns(&Recording::open_any(path)?) as i64,
+    };
+    let monotonic_ns = first.stamp_ns.saturating_sub(LEAD_NS);
+    Ok(ClockReading { monotonic_ns, realtime_ns: monotonic_ns as i64 + offset_ns })
+}
+
+/// Log time minus stamp of a recording; 0 if it does not say.
+pub fn log_offset_ns(recording: &Recording) -> u64 {
+    let stated = recording.metadata.get(topics::metadata::CLOCK).and_then(|clock| clock.get("log_offset_ns"));
+    stated.and_then(|text| text.parse().ok()).unwrap_or(0)
+}
+
+/// The head of a recording that is made of another one: its calibration, vehicle and clocks.
+pub fn replay_head(recording: &Recording, config: &RecordConfig) -> anyhow::Result<Head> {
+    let offset_ns = log_offset_ns(recording);
+    let boot_id = recording.metadata.get(topics::metadata::SOURCE).and_then(|source| source.get("boot_id"));
+    let start = ClockReading { monotonic_ns: 0, realtime_ns: offset_ns as i64 };
+    let mut head = Head::new(&config.resolved(), &recording.name, boot_id.map_or("", String::as_str), start);
+    head.calibration_json = recording.calibration_json().map(<[u8]>::to_vec);
+    Ok(head)
+}
+
+/// What a recording says about its camera.
+pub fn camera_facts(path: &Path) -> anyhow::Result<CameraFacts> {
+    let recording = Recording::open_any(path)?;
+    let camera = recording.metadata.get(topics::metadata::CAMERA);
+    let text = |key: &str| camera.and_then(|entries| entries.get(key)).cloned();
+    let (width_px, height_px) = recording.image_size_px.unwrap_or_default();
+    Ok(CameraFacts {
+        name: text("name").unwrap_or_else(|| recording.name.clone()),
+        width_px: width_px as u32,
+        height_px: height_px as u32,
+        frame_rate_hz: text("frame_rate_hz").and_then(|rate| rate.parse().ok()).unwrap_or(0.0),
+        pixel_format: text("sends").unwrap_or_else(|| "MJPG".into()),
+    })
+}
+
+fn scaled_clock(start: ClockReading, speed: f64, simulation: Option<&Simulation>) -> ScaledClock {
+    let clock = ScaledClock::new(start, speed);
+    let set = simulation.and_then(|simulation| simulation.intervals_ns(FaultKind::DateSet).next());
+    match set {
+        Some(interval) => clock.with_step(interval.start, DATE_STEP_NS),
+        None => clock,
+    }
+}
+
+/// `donut.json` as it is, once it is known to be one.
+fn read_calibration(path: &Path) -> anyhow::Result<Vec<u8>> {
+    let context = || format!("reading the calibration {}", path.display());
+    let json = fs::read(path).with_context(context)?;
+    let donut: DonutCalibration = serde_json::from_slice(&json).with_context(context)?;
+    donut.check().with_context(context)?;
+    Ok(json)
+}
+
+fn calibration_json(donut: &DonutCalibration) -> Vec<u8> {
+    serde_json::to_vec_pretty(donut).expect("a calibration is plain numbers")
+}
+
+/// Which start of the computer this is; the same for all drives until it is switched off.
+fn boot_id() -> String {
+    let id = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    let id = id.trim();
+    if id.is_empty() { "00000000-0000-0000-0000-000000000000".into() } else { id.into() }
+}

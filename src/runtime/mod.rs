@@ -1,0 +1,22 @@
+//! Which task feeds which, how devices are kept running, and how everything stops.
+//!
+//! ```text
+//! camera thread ─┐                                       ┌─► recorder's queue ─► writer thread ─► segments
+//! serial thread ─┼─► bounded queues ─► survey (one task) ─┤
+//! pins thread   ─┘                                       └─► status line, journal
+//! ```
+//!
+//! Nothing but the writer thread touches the disk. A device that fails is started again by its own thread and stops
+//! nobody else. On SIGTERM and SIGINT the producers stop, the queues drain and the recording is finished, all within
+//! [`live::STOP_LIMIT`].
+//!
+//! `drive` puts a drive together, `live` runs it, `supervisor` keeps each device running, and `survey` is what becomes
+//! of what they say; `playback` takes a recorded drive through the same survey without any clock.
+
+pub mod drive;
+pub mod live;
+pub mod playback;
+mod status;
+mod supervisor;
+pub mod survey;
+mod system;
