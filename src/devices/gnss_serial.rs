@@ -18,7 +18,8 @@ use std::{
 
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
-    termios::{ControlModes, OptionalActions, tcgetattr, tcsetattr},
+    fs::{Mode, OFlags},
+    termios::{ControlModes, OptionalActions, isatty, tcgetattr, tcsetattr},
 };
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use serialport::{SerialPort, TTYPort};
@@ -273,8 +274,15 @@ fn open_error(path: &Path, device: String, error: serialport::Error) -> DeviceEr
         ErrorKind::InvalidInput => DeviceError::Unsupported { device, what: error.description },
         // Unplugged between a look at the path and its opening.
         _ if !path.exists() => DeviceError::NotPresent { device },
+        _ if !is_terminal(path) => DeviceError::Unsupported { device, what: "it is no serial port".to_owned() },
         _ => DeviceError::Io { device, source: io::Error::other(error.description) },
     }
+}
+
+/// Only for the words of an error: opening an Arduino's port once more starts it over.
+fn is_terminal(path: &Path) -> bool {
+    let flags = OFlags::RDONLY | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    rustix::fs::open(path, flags, Mode::empty()).is_ok_and(isatty)
 }
 
 fn not_permitted(path: &Path, device: String) -> DeviceError {

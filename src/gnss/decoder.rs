@@ -218,7 +218,10 @@ impl Arrivals {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+    use crate::gnss::encode;
 
     fn chunk(arrival_ns: u64, bytes: &[u8]) -> SerialChunk {
         // 100 000 bit/s: 100 µs a byte.
@@ -270,6 +273,53 @@ mod tests {
             chunk(3_000_000_000, &[0; 300]),
         ]);
         assert_eq!(arrivals_ns(&found), [2_000_000_000]);
+    }
+
+    /// Bytes that look like something: pieces of sentences and packets among noise.
+    fn bytes() -> impl Strategy<Value = Vec<u8>> {
+        let packet = proptest::collection::vec(any::<u8>(), 0..40).prop_map(|data| {
+            let mut bytes = Vec::new();
+            encode::write_packet(xbus::MTDATA2, &data, &mut bytes);
+            bytes
+        });
+        let piece = prop_oneof![
+            proptest::collection::vec(any::<u8>(), 0..30),
+            proptest::collection::vec(proptest::sample::select(&b"$*,\r\n\xfa\xff\x36\x00"[..]), 0..30),
+            "[$][A-Z]{5},[0-9.,NEMT]{0,80}[*][0-9A-F]{2}\r\n".prop_map(String::into_bytes),
+            "(GNGGA|GNRMC|GPZDA|HEHDT|PASHR),[0-9]{6},[0-9.,NEMTA]{0,60}".prop_map(|content| {
+                let mut bytes = Vec::new();
+                encode::write_sentence(&content, &mut bytes);
+                bytes
+            }),
+            packet,
+        ];
+        proptest::collection::vec(piece, 0..20).prop_map(|pieces| pieces.concat())
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_survived_and_cutting_makes_no_difference(
+            bytes in bytes(),
+            cuts in proptest::collection::vec(any::<proptest::sample::Index>(), 0..30),
+        ) {
+            let at = |end: usize| NS_PER_S + end as u64 * 100_000;
+            let mut ends: Vec<_> = cuts.iter().map(|cut| cut.index(bytes.len() + 1)).collect();
+            ends.push(bytes.len());
+            ends.sort_unstable();
+            let starts = std::iter::once(0).chain(ends.iter().copied());
+            let pieces: Vec<_> =
+                starts.zip(&ends).map(|(start, &end)| chunk(at(end), &bytes[start..end])).collect();
+            prop_assert_eq!(decode(&pieces), decode(&[chunk(at(bytes.len()), &bytes)]));
+        }
+
+        #[test]
+        fn any_stamps_are_survived(chunks in proptest::collection::vec((any::<u64>(), any::<u32>(), bytes()), 0..6)) {
+            let chunks: Vec<_> = chunks
+                .into_iter()
+                .map(|(arrival_ns, baud, bytes)| SerialChunk { arrival_ns, baud, bytes })
+                .collect();
+            decode(&chunks);
+        }
     }
 
     #[test]

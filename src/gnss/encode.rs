@@ -216,9 +216,9 @@ impl XbusSensor {
         });
         item(0xE020, &mut data, |data| {
             const SELF_TEST: u32 = 1;
-            const WITH_GNSS: u32 = 3 << Status::FILTER_MODE_SHIFT;
-            let fix = if has_fix { Status::GNSS_FIX | WITH_GNSS } else { 0 };
-            data.extend((SELF_TEST | Status::FILTER_VALID | fix).to_be_bytes());
+            let (fix, mode) = if has_fix { (Status::GNSS_FIX, Status::WITH_GNSS) } else { (0, Status::COASTING) };
+            let mode = mode << Status::FILTER_MODE_SHIFT;
+            data.extend((SELF_TEST | Status::FILTER_VALID | fix | mode).to_be_bytes());
         });
         write_packet(xbus::MTDATA2, &data, out);
         self.counter = self.counter.wrapping_add(1);

@@ -41,7 +41,9 @@ impl Sensor {
     /// Whether the packet was of use. `emit` gets what follows from it.
     pub fn push(&mut self, said: &PacketSaid, arrival_ns: u64, emit: &mut dyn FnMut(GnssSample)) -> bool {
         if let (Some(now), Some(last)) = (said.counter, self.counter) {
-            self.packets_missed += u64::from(now.wrapping_sub(last).wrapping_sub(1));
+            // Backwards: the sensor was switched off and on.
+            let missed = now.wrapping_sub(last).wrapping_sub(1);
+            self.packets_missed += u64::from(if missed < 1 << 15 { missed } else { 0 });
         }
         self.counter = said.counter.or(self.counter);
         self.status = said.status.map(|status| (status, arrival_ns)).or(self.status);
@@ -113,6 +115,7 @@ impl Sensor {
                     receiver_quality(&own).map(|quality| (own.coordinates, own.altitude_m, quality, "GNSS PVT"));
                 (1, place, Some(own.velocity_east_north_mps))
             }
+            (None, None) if said.status.is_some_and(|status| !status.has_gnss_fix()) => (1, None, None),
             (None, None) => return false,
         };
         if !self.position_source.admits(rank, arrival_ns) {
@@ -145,11 +148,15 @@ impl Sensor {
         emit: &mut dyn FnMut(GnssSample),
     ) -> bool {
         let Some(yaw_rad) = said.yaw_rad else { return false };
-        if recent(self.status, arrival_ns).is_some_and(|status| !status.filter_is_valid()) {
+        let status = recent(self.status, arrival_ns);
+        if status.is_some_and(|status| !status.filter_is_valid()) {
             emit(GnssSample::Rejected { arrival_ns, reason: FILTER_INVALID });
             return true;
         }
-        let (yaw_std_rad, north, source) = (None, North::True, "MTData2");
+        // Without satellites for longer than it can coast, and in sensors that have no receiver, the compass is what is left.
+        let is_compass = status.is_some_and(|status| filter_quality(Some(status)).is_none());
+        let north = if is_compass { North::Magnetic } else { North::True };
+        let (yaw_std_rad, source) = (None, "MTData2");
         emit(GnssSample::Heading(Heading { arrival_ns, sample_time, yaw_rad, yaw_std_rad, north, source }));
         true
     }
@@ -157,11 +164,10 @@ impl Sensor {
 
 /// None: the filter has no position. A sensor that sends no status is believed.
 fn filter_quality(status: Option<Status>) -> Option<FixQuality> {
-    const COASTING: u32 = 1;
     match status {
         Some(status) if !status.filter_is_valid() => None,
         Some(status) if status.has_gnss_fix() => Some(FixQuality::Autonomous),
-        Some(status) if status.filter_mode() == COASTING => Some(FixQuality::DeadReckoning),
+        Some(status) if status.filter_mode() == Status::COASTING => Some(FixQuality::DeadReckoning),
         Some(_) => None,
         None => Some(FixQuality::Autonomous),
     }
@@ -255,7 +261,7 @@ mod tests {
     #[test]
     fn counter_gaps_are_packets_missed() {
         let mut sensor = Sensor::default();
-        for counter in [65_534, 65_535, 0, 1, 5] {
+        for counter in [65_534, 65_535, 0, 1, 5, 5, 2] {
             sensor.push(&PacketSaid { counter: Some(counter), ..PacketSaid::default() }, 0, &mut |_| {});
         }
         assert_eq!(sensor.packets_missed, 3);

@@ -85,7 +85,7 @@ impl AxesSense {
     pub const ALL: [Self; 3] = [Self::EastNorthUp, Self::NorthEastDown, Self::NorthWestUp];
 
     fn of(identifier: u16) -> Option<Self> {
-        Self::ALL.get(usize::from(identifier >> 2 & 3)).copied()
+        Self::ALL.get(usize::from((identifier >> 2) & 3)).copied()
     }
 
     pub(super) fn bits(self) -> u16 {
@@ -155,6 +155,9 @@ impl Status {
     pub const FILTER_VALID: u32 = 1 << 1;
     pub const GNSS_FIX: u32 = 1 << 2;
     pub const FILTER_MODE_SHIFT: u32 = 23;
+    /// Filter modes: without satellites for up to 45 s, and with them. 0 is without them for longer.
+    pub const COASTING: u32 = 1;
+    pub const WITH_GNSS: u32 = 3;
 
     pub fn filter_is_valid(self) -> bool {
         self.0 & Self::FILTER_VALID != 0
@@ -164,9 +167,8 @@ impl Status {
         self.0 & Self::GNSS_FIX != 0
     }
 
-    /// 0 without GNSS, 1 coasting for up to 45 s, 3 with GNSS.
     pub fn filter_mode(self) -> u32 {
-        self.0 >> Self::FILTER_MODE_SHIFT & 7
+        (self.0 >> Self::FILTER_MODE_SHIFT) & 7
     }
 }
 
