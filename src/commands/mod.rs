@@ -12,8 +12,10 @@ pub mod import;
 pub mod info;
 pub mod man;
 pub mod map_report;
+pub mod mark;
 pub mod options;
 pub mod progress;
+pub mod recover;
 pub mod survey;
 pub mod train;
 
@@ -30,6 +32,8 @@ pub const DONE: u8 = 0;
 pub const FAILED: u8 = 1;
 /// Bad arguments or a bad configuration file.
 pub const BAD_ARGUMENTS: u8 = 2;
+/// Done, but data was lost.
+pub const DATA_LOST: u8 = 3;
 
 /// Tells a vehicle where it is from one omnidirectional camera
 ///
@@ -52,6 +56,8 @@ pub enum Command {
     Export(export::Args),
     Info(info::Args),
     Check(check::Args),
+    Recover(recover::Args),
+    Mark(mark::Args),
     Completions(completions::Args),
     Man(man::Args),
 }
@@ -67,6 +73,8 @@ impl Command {
             Self::Export(args) => export::run(args),
             Self::Info(args) => info::run(args),
             Self::Check(args) => check::run(args),
+            Self::Recover(args) => recover::run(args),
+            Self::Mark(args) => mark::run(args),
             Self::Completions(args) => completions::run(args, Cli::command()),
             Self::Man(args) => man::run(args, Cli::command()),
         }
