@@ -399,7 +399,6 @@ impl DriveWriter {
         if self.facts.error.take().is_some() {
             info!("the disk works again");
         }
-        self.facts.is_full = false;
         self.failures = 0;
     }
 
