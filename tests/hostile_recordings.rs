@@ -6,7 +6,7 @@ use std::{fs, io::Cursor, path::Path, sync::OnceLock};
 
 use common::{TinyDataset, jpeg};
 use mcap::{Compression, WriteOptions, records::MessageHeader};
-use omniloc::recording::{Recording, RecordingError, verify};
+use omniloc::recording::{Recording, RecordingError, recover::recover_bytes, verify};
 use proptest::prelude::*;
 
 fn sound_recording() -> &'static [u8] {
@@ -28,6 +28,12 @@ fn read_bytes(bytes: &[u8]) -> (bool, Option<usize>) {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("hostile.mcap");
     fs::write(&path, bytes).expect("writes");
+    let (recovery, recovered) = recover_bytes(bytes).expect("memory can be written to");
+    let recovered_path = folder.path().join("recovered.mcap");
+    fs::write(&recovered_path, recovered).expect("writes");
+    let verdict = verify(&recovered_path).expect("readable");
+    assert!(verdict.is_complete, "{:?}", verdict.problems);
+    assert_eq!(verdict.messages, recovery.messages);
     read_everything(&path)
 }
 

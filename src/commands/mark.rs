@@ -1,27 +1,32 @@
-//! `omniloc mark`: keep what is being recorded.
+//! `omniloc mark`: keeps what is being recorded from being deleted.
 
-use std::{fs, path::PathBuf, process::ExitCode};
+use std::{path::PathBuf, process::ExitCode};
 
 use anyhow::Context;
 
-use super::{BadArgument, DONE};
-use crate::recording::recorder::MARK_REQUEST;
+use super::{BadArgument, DONE, print};
+use crate::recording::recorder::request_mark;
 
-/// Keep what is being recorded from being deleted when the disk is full
+/// Keep the segment being recorded, and the one before it, when the disk gets full
 ///
-/// The present segment and the one before it are marked within a second. The button and SIGUSR1 do the same.
+/// Works on a folder that `record` is writing to; the recorder marks the segments within a second. To release them,
+/// remove the empty .keep files beside them.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The folder that `record` writes to
-    #[arg(value_name = "FOLDER")]
+    /// Folder that is being recorded to
     pub folder: PathBuf,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let folder = args.folder.display();
     if !args.folder.is_dir() {
-        return Err(BadArgument(format!("{}: no such folder", args.folder.display())).into());
+        return Err(BadArgument(format!("{folder}: no such folder")).into());
     }
-    let request = args.folder.join(MARK_REQUEST);
-    fs::write(&request, "").with_context(|| format!("writing {}", request.display()))?;
+    if !request_mark(&args.folder).with_context(|| format!("asking the recorder in {folder}"))? {
+        return Err(
+            BadArgument(format!("{folder}: nothing is being recorded there; expected the recorder's folder")).into()
+        );
+    }
+    print(&format!("{folder}: the present and the previous segment will be kept\n"))?;
     Ok(DONE.into())
 }

@@ -17,6 +17,7 @@ pub mod mark;
 pub mod options;
 pub mod progress;
 pub mod record;
+pub mod recover;
 pub mod replay;
 pub mod simulate;
 pub mod survey;
@@ -53,7 +54,6 @@ pub struct Cli {
 pub enum Command {
     Demo(demo::Args),
     Record(record::Args),
-    Mark(mark::Args),
     Replay(replay::Args),
     Import(import::Args),
     Calibrate(calibrate::CalibrateArgs),
@@ -63,6 +63,8 @@ pub enum Command {
     Simulate(simulate::Args),
     Info(info::Args),
     Check(check::Args),
+    Recover(recover::Args),
+    Mark(mark::Args),
     Completions(completions::Args),
     Man(man::Args),
 }
@@ -72,7 +74,6 @@ impl Command {
         match self {
             Self::Demo(args) => demo::run(args),
             Self::Record(args) => record::run(args),
-            Self::Mark(args) => mark::run(args),
             Self::Replay(args) => replay::run(args),
             Self::Import(args) => import::run(args),
             Self::Calibrate(args) => calibrate::run(args),
@@ -82,6 +83,8 @@ impl Command {
             Self::Simulate(args) => simulate::run(args),
             Self::Info(args) => info::run(args),
             Self::Check(args) => check::run(args),
+            Self::Recover(args) => recover::run(args),
+            Self::Mark(args) => mark::run(args),
             Self::Completions(args) => completions::run(args, Cli::command()),
             Self::Man(args) => man::run(args, Cli::command()),
         }

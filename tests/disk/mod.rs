@@ -59,7 +59,8 @@ struct State {
     unsynced_changes: Vec<FolderChange>,
     operations: u64,
     plan: Option<FaultPlan>,
-    space: Space,
+    /// Of the whole disk; 0: more than enough.
+    capacity_bytes: u64,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -69,17 +70,18 @@ pub struct Disk {
 
 impl Disk {
     pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// A disk that gets full.
+    pub fn with_capacity(capacity_bytes: u64) -> Self {
         let disk = Self::default();
-        disk.set_space(Space { free_bytes: 1 << 40, total_bytes: 1 << 41 });
+        disk.lock().capacity_bytes = capacity_bytes;
         disk
     }
 
     pub fn set_plan(&self, plan: Option<FaultPlan>) {
         self.lock().plan = plan;
-    }
-
-    pub fn set_space(&self, space: Space) {
-        self.lock().space = space;
     }
 
     /// Operations so far.
@@ -118,7 +120,8 @@ impl Disk {
             Inode { cached: survived.clone(), synced: survived }
         });
         let inodes = inodes.collect();
-        let state = State { inodes, synced_folder: folder.clone(), folder, space: state.space, ..State::default() };
+        let capacity_bytes = state.capacity_bytes;
+        let state = State { inodes, synced_folder: folder.clone(), folder, capacity_bytes, ..State::default() };
         Self { state: Arc::new(Mutex::new(state)) }
     }
 
@@ -177,6 +180,14 @@ impl State {
         self.plan.filter(|plan| (plan.from..plan.to).contains(&number)).map(|plan| plan.fault)
     }
 
+    fn space(&self) -> Space {
+        if self.capacity_bytes == 0 {
+            return Space { free_bytes: 1 << 40, total_bytes: 1 << 41 };
+        }
+        let used: u64 = self.folder.values().map(|&inode| self.inodes[inode].cached.len() as u64).sum();
+        Space { free_bytes: self.capacity_bytes.saturating_sub(used), total_bytes: self.capacity_bytes }
+    }
+
     fn change(&mut self, change: FolderChange) {
         apply(&mut self.folder, &change);
         self.unsynced_changes.push(change);
@@ -205,7 +216,10 @@ impl Write for OpenFile {
         let mut state = self.disk.lock();
         let first = state.plan.map(|plan| plan.from);
         let is_first = first == Some(state.operations);
-        let fault = state.next();
+        let mut fault = state.next();
+        if fault.is_none() && state.space().free_bytes < bytes.len() as u64 {
+            fault = Some(Fault::Error(io::ErrorKind::StorageFull));
+        }
         let cached = &mut state.inodes[self.inode].cached;
         match fault {
             Some(Fault::ShortWrite) if is_first => {
@@ -299,7 +313,7 @@ impl Storage for Disk {
     }
 
     fn space(&self) -> io::Result<Space> {
-        Ok(self.lock().space)
+        Ok(self.lock().space())
     }
 
     fn sync_folder(&self) -> io::Result<()> {

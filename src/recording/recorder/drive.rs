@@ -45,7 +45,7 @@ const LAST_RETRY_NS: u64 = 5 * NS_PER_S;
 const GUARD_INTERVAL_NS: u64 = NS_PER_S / 2;
 /// Unsynced for longer than this: the disk is slow.
 const SLOW_NS: u64 = 2 * NS_PER_S;
-/// A file of this name in the folder asks for the present segment to be marked.
+/// A file of this name in the folder asks for the present segment to be marked: `omniloc mark`.
 pub const MARK_REQUEST: &str = "mark.request";
 
 /// State of the disk in a word.
@@ -82,6 +82,8 @@ pub struct DriveWriter {
     guard_at_ns: u64,
     /// Segments that want to be marked.
     marks: Vec<SegmentName>,
+    /// Abandoned segments that could not be cut where they were last synced, and where that was.
+    uncut: Vec<(SegmentName, Appender, u64)>,
     /// Cut segments that nobody has been told of.
     abandoned: Vec<SegmentName>,
     facts: Facts,
@@ -157,6 +159,7 @@ impl DriveWriter {
             failures: 0,
             guard_at_ns: 0,
             marks: Vec::new(),
+            uncut: Vec::new(),
             abandoned: Vec::new(),
             facts: Facts::default(),
         })
@@ -184,6 +187,7 @@ impl DriveWriter {
         if now_ns >= self.guard_at_ns {
             self.guard_at_ns = now_ns + GUARD_INTERVAL_NS;
             self.keep_room();
+            self.cut_abandoned();
             self.read_mark_request();
         }
         self.write_marks();
@@ -220,10 +224,11 @@ impl DriveWriter {
                 self.close();
             }
             if self.pending() == 0 && self.losses.is_empty() {
-                return true;
+                break;
             }
         }
-        false
+        self.cut_abandoned();
+        self.pending() == 0 && self.losses.is_empty()
     }
 
     /// Bytes of entries that are no longer kept, since the last call.
@@ -255,6 +260,11 @@ impl DriveWriter {
         let open = [&self.current, &self.closing].into_iter().flatten();
         let oldest = open.filter_map(|open| open.unsynced.front());
         oldest.chain(self.waiting.front()).map(|queued| queued.pushed_ns).min()
+    }
+
+    /// Messages that the disk's failures cost.
+    pub fn lost(&self) -> u64 {
+        self.facts.lost
     }
 
     /// One of [`disk`].
@@ -389,7 +399,6 @@ impl DriveWriter {
         if self.facts.error.take().is_some() {
             info!("the disk works again");
         }
-        self.facts.is_full = false;
         self.failures = 0;
     }
 
@@ -485,11 +494,8 @@ impl DriveWriter {
         self.note_failure(&io_error(error));
         let Some(open) = self.open(which).take() else { return };
         let OpenSegment { name, segment, synced_bytes, unsynced, last_image, .. } = open;
-        // If this fails as well, some messages may be in two segments.
-        if let Err(error) = segment.abandon().cut(synced_bytes) {
-            warn!(segment = name.file(Part::Open), %error, "segment could not be cut where it was last synced");
-        }
-        self.abandoned.push(name);
+        self.uncut.push((name, segment.abandon(), synced_bytes));
+        self.cut_abandoned();
         let first_kept = unsynced.iter().find_map(|queued| match queued.entry {
             Entry::Image { sequence, .. } => Some(sequence),
             _ => None,
@@ -510,6 +516,18 @@ impl DriveWriter {
                 }
             }
         }
+    }
+
+    /// Cuts abandoned segments where they were last synced, so that no message is in two segments.
+    fn cut_abandoned(&mut self) {
+        let abandoned = &mut self.abandoned;
+        self.uncut.retain_mut(|(name, file, synced_bytes)| {
+            let is_cut = file.cut(*synced_bytes).is_ok();
+            if is_cut {
+                abandoned.push(name.clone());
+            }
+            !is_cut
+        });
     }
 
     /// Decides when to try again: at once the first time and when room could be made, then later and later.

@@ -26,7 +26,7 @@ pub use entry::{Encoder, Entry, Loss};
 pub use mend::{Mended, cut_segments, mend};
 pub use queue::{Queue, Queued};
 pub use segments::{Head, Part, Segment, SegmentName};
-pub use storage::{FileFacts, Folder, ReadSeek, SegmentFile, Space, Storage};
+pub use storage::{FileFacts, Folder, ReadSeek, SegmentFile, Space, Storage, request_mark};
 pub use thread::{Recorder, RecorderHandle, RecorderHealth, RecorderReport};
 
 /// `[recorder]` of the configuration.

@@ -196,7 +196,7 @@ impl Appender {
     }
 
     /// Gives up what was not synced, as far as the disk still listens.
-    pub fn cut(mut self, synced_bytes: u64) -> io::Result<()> {
+    pub fn cut(&mut self, synced_bytes: u64) -> io::Result<()> {
         self.buffer.clear();
         self.file.set_len(synced_bytes)
     }

@@ -15,7 +15,7 @@ mod window;
 
 use std::{
     collections::BTreeMap,
-    io::{self, Read, Seek, Write},
+    io::{self, Read, Seek, SeekFrom, Write},
     path::Path,
 };
 
@@ -26,7 +26,7 @@ use super::{
     error::RecordingError,
     reader::TopicSummary,
     topics::metadata,
-    verify::{Verdict, verify},
+    verify::{Verdict, verify_reader},
 };
 
 /// A part of the file that could not be used.
@@ -89,20 +89,31 @@ pub fn recover_file(path: &Path, out: &Path) -> Result<Recovery, RecoverError> {
         return Err(cannot_read(io::Error::other("not a regular file")).into());
     }
     let mut recovery = Recovery::default();
-    // Verified under the temporary name: a file that takes the final one is right.
     write_file_atomically(out, |file| {
+        let cannot_write = |cause| RecordingError::CannotWrite { path: out.into(), cause };
         recovery = recover(input, &mut *file, &mut || Ok(())).map_err(|error| match error {
             StreamError::Read(source) => cannot_read(source),
-            StreamError::Write(cause) => RecordingError::CannotWrite { path: out.into(), cause },
+            StreamError::Write(cause) => cannot_write(cause),
         })?;
         if recovery.messages == 0 {
             return Err(RecoverError::NothingThere { path: path.into() });
         }
-        Ok(())
+        // Read back before it gets its name; the clone shares its position with the file.
+        let mut written = file.get_ref().try_clone().map_err(cannot_write)?;
+        let size = file.stream_position().map_err(cannot_write)?;
+        file.flush().and_then(|()| written.rewind()).map_err(cannot_write)?;
+        let verdict = verify_reader(out, written, size)?;
+        file.seek(SeekFrom::End(0)).map_err(cannot_write)?;
+        compare(&verdict, &recovery).map_err(|what| RecoverError::NotVerified { path: out.into(), what })
     })?;
-    let verdict = verify(out)?;
-    compare(&verdict, &recovery).map_err(|what| RecoverError::NotVerified { path: out.into(), what })?;
     Ok(recovery)
+}
+
+/// What is whole in these bytes, and the new recording of it. `None` if it cannot be written.
+pub fn recover_bytes(bytes: &[u8]) -> Option<(Recovery, Vec<u8>)> {
+    let mut out = io::Cursor::new(Vec::new());
+    let recovery = recover(io::Cursor::new(bytes), &mut out, &mut || Ok(())).ok()?;
+    Some((recovery, out.into_inner()))
 }
 
 /// Whether the new recording holds what was found in the old one.

@@ -113,7 +113,7 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
                 Step::Next(next) => offset = next,
                 Step::End => return Ok(()),
                 Step::Lost => {
-                    let next = self.find_record(offset + 1)?;
+                    let next = if self.budget_bytes == 0 { size } else { self.find_record(offset + 1)? };
                     self.lose(offset, next)?;
                     self.trust = Trust::Damaged;
                     offset = next;
@@ -199,7 +199,8 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
         if whole {
             return Ok(Step::Next(next));
         }
-        if !self.may_start_record(next)? {
+        self.budget_bytes = self.budget_bytes.saturating_sub(length);
+        if self.budget_bytes == 0 || !self.may_start_record(next)? {
             return Ok(Step::Lost);
         }
         self.lose(offset, next)?;
@@ -248,6 +249,10 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
         if outcome.is_ok() {
             self.trust = trust;
             return Ok(Step::Next(end));
+        }
+        self.budget_bytes = self.budget_bytes.saturating_sub(length);
+        if self.budget_bytes == 0 {
+            return Ok(Step::Lost);
         }
         if !header.is_compressed && self.window.touches_zero_sector(inside, end - inside).map_err(StreamError::Read)? {
             self.trust = Trust::Plain.min(self.trust);

@@ -46,8 +46,8 @@ impl<'a, R: Read + Seek> Window<'a, R> {
 
     fn load(&mut self, offset: u64, end: u64) -> io::Result<()> {
         (self.before_read)()?;
-        // Whole sectors, so that the damage check sees all of the first one.
-        let start = offset - offset % SECTOR_BYTES;
+        // Whole blocks, so that the damage check sees all of the first sector.
+        let start = offset - offset % BAD_BLOCK_BYTES as u64;
         let wanted = ((end - start) as usize).max(READ_BYTES).min((self.size - start) as usize);
         self.buffer.clear();
         self.buffer.resize(wanted, 0);
