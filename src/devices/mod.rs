@@ -12,6 +12,7 @@
 //! paired elsewhere, so that a replayed drive takes the same way as a live one.
 
 pub mod camera_v4l2;
+pub mod gpio;
 
 pub mod mjpeg;
 pub mod yuyv;
