@@ -275,6 +275,16 @@ mod tests {
         }
     }
 
+    /// What libjpeg calls "extraneous bytes before marker" and the C310 sends every now and then.
+    #[test]
+    fn bytes_too_many_before_a_restart_marker_do_no_harm() {
+        let whole = picture();
+        let at = marker(&whole, 0xD3);
+        let mut frame = [&whole[..at], &[0x12, 0x34], &whole[at..]].concat();
+        assert_eq!(MjpegMender::new(WIDTH_PX, HEIGHT_PX).mend(&mut frame, false), None);
+        assert_eq!(luma(&frame), luma(&whole));
+    }
+
     proptest::proptest! {
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(proptest::num::u8::ANY, 0..800), at in 0usize..4000, cut in 0usize..4000) {
