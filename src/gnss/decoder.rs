@@ -99,9 +99,8 @@ impl GnssDecoder {
     pub fn push(&mut self, chunk: &SerialChunk, out: &mut Vec<GnssSample>) {
         let Self { framer, arrivals, interpreter } = self;
         arrivals.note(chunk, framer.pending_bytes());
-        let mut end = arrivals.end - chunk.bytes.len() as u64;
-        for &byte in &chunk.bytes {
-            end += 1;
+        let first_end = arrivals.end - chunk.bytes.len() as u64 + 1;
+        for (end, &byte) in (first_end..).zip(&chunk.bytes) {
             framer.push(byte, &mut |framed, bytes_after| {
                 let frame_end = end - bytes_after as u64;
                 let frame_bytes = match framed {

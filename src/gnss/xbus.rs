@@ -111,7 +111,7 @@ impl AxesSense {
     }
 
     /// A vector in east, north, up in this frame.
-    pub(super) fn from_enu(self, [east, north, up]: [f64; 3]) -> [f64; 3] {
+    pub(super) fn of_enu(self, [east, north, up]: [f64; 3]) -> [f64; 3] {
         match self {
             Self::EastNorthUp => [east, north, up],
             Self::NorthEastDown => [north, east, -up],
