@@ -106,6 +106,8 @@ impl Default for Column {
 const TEXEL_RAD: f32 = 0.0046;
 /// Between neighbouring columns, as a side that is seen at a low angle spreads it \[rad\].
 const COLUMN_RAD: f32 = 0.0021;
+/// What stands against a wall is taken to be this much nearer \[m\].
+const CLEARANCE_M: f32 = 0.002;
 /// Nearer than this nothing is painted \[m\].
 const NEAREST_M: f32 = 0.05;
 
@@ -144,7 +146,8 @@ impl Column {
         };
         self.hits.push(hit);
         if above_m < 0.0 || block.bottom_m > ray.height_m {
-            self.hits.push(Hit { depth_m: exit_m, what: What::Lid, ..hit });
+            // Before the wall that the block may stand against.
+            self.hits.push(Hit { depth_m: exit_m - CLEARANCE_M, what: What::Lid, ..hit });
         }
     }
 
@@ -160,8 +163,8 @@ impl Column {
         });
     }
 
-    /// Paints all that the ray met into `out`, one colour a row.
-    pub fn paint(&mut self, scene: &Scene, rows: &Rows, ray: &Ray, out: &mut [Color]) {
+    /// Puts what the ray met in order, and says which rows show what lies behind and below all blocks.
+    pub fn arrange(&mut self, scene: &Scene, rows: &Rows, ray: &Ray) -> Background {
         self.hits.sort_unstable_by(|a, b| a.depth_m.total_cmp(&b.depth_m));
         let mut hidden_below = f32::NEG_INFINITY;
         let mut base = None;
@@ -178,13 +181,13 @@ impl Column {
                 }
             }
         }
-        let ground_from = base.map_or(rows.above_horizon, |tangent| rows.at(tangent) as usize);
         let above_to = if hidden_below > 0.0 { rows.at(hidden_below).ceil() as usize } else { rows.above_horizon };
-        match scene.above {
-            Above::Sky(sky) => sky.column(ray.azimuth_turns, &mut out[..above_to.min(rows.above_horizon)]),
-            Above::Ceiling(plane) => paint_plane(plane, rows, ray, 0..above_to, out),
-        }
-        paint_plane(scene.ground, rows, ray, ground_from..out.len(), out);
+        let ground_from = base.map_or(rows.above_horizon, |tangent| rows.at(tangent) as usize);
+        Background { above_to: above_to.min(rows.above_horizon), ground_from: ground_from.max(rows.above_horizon) }
+    }
+
+    /// Paints all that the ray met into `out`, one colour a row, over the background.
+    pub fn paint(&self, scene: &Scene, rows: &Rows, ray: &Ray, out: &mut [Color]) {
         for hit in self.hits.iter().rev() {
             match hit.what {
                 What::Side(side) => paint_side(scene, rows, ray, hit, usize::from(side), out),
@@ -195,14 +198,33 @@ impl Column {
     }
 }
 
+/// Rows that show sky or ceiling, up to `above_to`, and ground, from `ground_from`.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Background {
+    above_to: usize,
+    ground_from: usize,
+}
+
+impl Background {
+    /// What shows for either of two.
+    pub fn with(self, other: Self) -> Self {
+        Self { above_to: self.above_to.max(other.above_to), ground_from: self.ground_from.min(other.ground_from) }
+    }
+
+    pub fn paint(self, scene: &Scene, rows: &Rows, ray: &Ray, out: &mut [Color]) {
+        match scene.above {
+            Above::Sky(sky) => sky.column(ray.azimuth_turns, &mut out[..self.above_to]),
+            Above::Ceiling(plane) => paint_plane(plane, rows, ray, 0..self.above_to, out),
+        }
+        paint_plane(scene.ground, rows, ray, self.ground_from..out.len(), out);
+    }
+}
+
 fn paint_plane(plane: &Plane, rows: &Rows, ray: &Ray, range: std::ops::Range<usize>, out: &mut [Color]) {
     let above_m = plane.height_m - ray.height_m;
     let from = [0, 1].map(|axis| ray.from_m[axis] - plane.corner_m[axis]);
     for row in range {
         let distance_m = above_m / rows.tangents[row];
-        if distance_m <= 0.0 {
-            continue;
-        }
         // Seen at a low angle a row covers much more in depth than across.
         let depth_m = TEXEL_RAD * distance_m * (distance_m / above_m.abs()).max(1.0);
         let (level, per_m) = plane.texture.level((0.5 * depth_m).max(TEXEL_RAD * distance_m));

@@ -32,6 +32,8 @@ mod random;
 mod render;
 mod scene;
 mod sensor;
+#[cfg(test)]
+mod tests;
 mod texture;
 mod town;
 mod traffic;

@@ -22,6 +22,9 @@ pub(super) const PANORAMA_ROWS: usize = 256;
 /// Rays, two to a column.
 const RAYS: usize = 2 * PANORAMA_COLUMNS;
 
+/// A tree or a pole as near as this is not painted: the camera would be within it.
+const NEAREST_UPRIGHT_M: f32 = 0.3;
+
 /// The panorama column by column; the first column follows the last once more.
 #[derive(Debug, Clone)]
 pub(super) struct Planes {
@@ -167,9 +170,15 @@ impl Renderer {
             ground: &self.ground,
             above: self.ceiling.as_ref().map_or(Above::Sky(&self.sky), Above::Ceiling),
         };
-        let painted = self.painted.chunks_exact_mut(PANORAMA_ROWS);
-        for ((column, ray), out) in self.columns.iter_mut().zip(&self.rays).zip(painted) {
-            column.paint(&scene, &self.rows, ray, out);
+        let pairs = self.columns.chunks_exact_mut(2).zip(self.rays.chunks_exact(2));
+        for ((columns, rays), out) in pairs.zip(self.painted.chunks_exact_mut(2 * PANORAMA_ROWS)) {
+            let [left, right] = [0, 1].map(|i| columns[i].arrange(&scene, &self.rows, &rays[i]));
+            let (left_out, right_out) = out.split_at_mut(PANORAMA_ROWS);
+            // Planes and sky are smooth at this scale: painted once for both.
+            left.with(right).paint(&scene, &self.rows, &rays[0], left_out);
+            right_out.copy_from_slice(left_out);
+            columns[0].paint(&scene, &self.rows, &rays[0], left_out);
+            columns[1].paint(&scene, &self.rows, &rays[1], right_out);
         }
         self.develop();
     }
@@ -219,11 +228,11 @@ impl Renderer {
         for (index, upright) in self.uprights.iter().enumerate() {
             let (x, y) = (upright.center_m[0] - eye_m[0], upright.center_m[1] - eye_m[1]);
             let distance_m = x.hypot(y);
-            if distance_m < 1.1 * upright.half_width_m {
+            if distance_m < NEAREST_UPRIGHT_M {
                 continue;
             }
             let middle = to_ray(x, y);
-            let reach = f64::from((upright.half_width_m / distance_m).asin()) * per_rad;
+            let reach = f64::from((upright.half_width_m / distance_m).min(1.0).asin()) * per_rad;
             for ray_index in (middle - reach).ceil() as i64..=(middle + reach).floor() as i64 {
                 let ray_index = ray_index.rem_euclid(RAYS as i64) as usize;
                 let [dx, dy] = self.rays[ray_index].direction;

@@ -112,7 +112,7 @@ pub(super) struct Plane {
 }
 
 impl Plane {
-    /// `color(x_m, y_m)` of every texel.
+    /// `color(x_m, y_m)` of every texel, not yet filtered.
     pub fn painted(
         height_m: f32,
         corner_m: [f32; 2],
@@ -126,7 +126,7 @@ impl Plane {
             let x_m = corner_m[0] + (i as f32 + 0.5) / texels_per_m;
             texels.extend((0..rows).map(|j| color(x_m, corner_m[1] + (j as f32 + 0.5) / texels_per_m)));
         }
-        Self { height_m, corner_m, texture: Texture::new(columns, rows, texels, texels_per_m) }
+        Self { height_m, corner_m, texture: Texture::unfiltered(columns, rows, texels, texels_per_m) }
     }
 }
 

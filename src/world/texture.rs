@@ -53,12 +53,13 @@ pub(super) struct Level {
 impl Texture {
     /// Takes `texels` column by column.
     pub fn new(columns: usize, rows: usize, texels: Vec<Color>, texels_per_m: f32) -> Self {
+        Self::unfiltered(columns, rows, texels, texels_per_m).refilter()
+    }
+
+    /// Without the coarser levels: for what is changed before it is shown.
+    pub fn unfiltered(columns: usize, rows: usize, texels: Vec<Color>, texels_per_m: f32) -> Self {
         assert_eq!(texels.len(), columns * rows, "one colour a texel");
-        let mut levels = vec![Level { columns, rows, texels }];
-        while let Some(coarser) = levels.last().and_then(Level::halved) {
-            levels.push(coarser);
-        }
-        Self { texels_per_m, levels }
+        Self { texels_per_m, levels: vec![Level { columns, rows, texels }] }
     }
 
     /// The level whose texels are as large as `footprint_m`, and its texels per metre.
@@ -76,10 +77,12 @@ impl Texture {
     }
 
     /// Makes the coarser levels anew after the finest was changed.
-    pub fn refilter(self) -> Self {
-        let texels_per_m = self.texels_per_m;
-        let finest = self.levels.into_iter().next().expect("a texture has a finest level");
-        Self::new(finest.columns, finest.rows, finest.texels, texels_per_m)
+    pub fn refilter(mut self) -> Self {
+        self.levels.truncate(1);
+        while let Some(coarser) = self.levels.last().and_then(Level::halved) {
+            self.levels.push(coarser);
+        }
+        self
     }
 }
 

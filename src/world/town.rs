@@ -26,7 +26,7 @@ const SIDE_STREET_M: f32 = 42.0;
 /// Where the vehicle turns in a side street, from the middle of the crossing.
 const TURNING_M: f64 = 40.0;
 const HOUSE_DEPTH_M: f32 = 10.0;
-const GROUND_TEXELS_PER_M: f32 = 8.0;
+const GROUND_TEXELS_PER_M: f32 = 6.0;
 
 /// The middle lines of the two streets each way.
 #[derive(Debug, Clone, Copy)]
@@ -350,7 +350,7 @@ fn ground_color(streets: &Streets, noise: u32, x: f32, y: f32) -> Color {
             return tinted(rgb(168, 166, 160), grain);
         }
         let slab = white((x / 0.75).floor() as i32, (y / 0.75).floor() as i32, noise ^ 5);
-        let joint = if (x / 0.75).fract().abs() < 0.16 || (y / 0.75).fract().abs() < 0.16 { 0.8 } else { 1.0 };
+        let joint = if (x / 0.75).fract().abs() < 0.2 || (y / 0.75).fract().abs() < 0.2 { 0.8 } else { 1.0 };
         let stain = fractal(0.25 * x, 0.25 * y, noise ^ 6);
         return tinted(rgb(146, 138, 128), grain * joint * (0.75 + 0.2 * slab + 0.3 * stain));
     }

@@ -165,7 +165,7 @@ impl Traffic {
         let mut random = stream(day.seed, Stream::Parked);
         let mut blocks = Vec::new();
         for place in &world.parking {
-            let (taken, turned) = (random.random_bool(day.parked_share.clamp(0.0, 1.0)), random.random_bool(0.2));
+            let (taken, turned) = (random.random::<f64>() < day.parked_share, random.random_bool(0.2));
             let (look, on_m) = (random.random_range(0..self.looks.len()), random.random_range(-0.4..0.4));
             if taken {
                 let [x, y] = place.direction;
