@@ -12,8 +12,10 @@ use super::{
     map_report,
     options::check_input,
     print, printable,
+    progress::Progress,
 };
 use crate::recording::{Recording, RecordingError, TopicSummary};
+use crate::sync::{RecordedLag, latency_from_recording};
 
 /// Show what is in a recording or map
 #[derive(Debug, clap::Args)]
@@ -48,12 +50,32 @@ fn show_map(args: &Args) -> anyhow::Result<()> {
 fn show_recording(args: &Args) -> anyhow::Result<()> {
     let recording = Recording::open_any(&args.file)?;
     let size_bytes = size_bytes(args);
+    let lag = lag_of_pairs(&recording)?;
     print(&if args.json {
-        format!("{:#}\n", as_json(&recording, size_bytes))
+        format!("{:#}\n", as_json(&recording, size_bytes, lag))
     } else {
-        as_text(&recording, size_bytes)
+        as_text(&recording, size_bytes, lag)
     })?;
     Ok(())
+}
+
+/// By how much pairs and pictures disagree, if the recording shows it; decodes some hundred frames.
+fn lag_of_pairs(recording: &Recording) -> anyhow::Result<Option<RecordedLag>> {
+    let progress = Progress::new();
+    let lag = latency_from_recording(recording, |frame, of| {
+        if frame == 1 {
+            progress.begin("comparing turns with the pictures", of);
+        }
+        progress.advance(1);
+    });
+    progress.finish();
+    lag.with_context(|| format!("comparing turns with the pictures of {}", recording.path.display()))
+}
+
+fn describe_lag(RecordedLag { late_s, std_s, turns }: RecordedLag) -> String {
+    let word = if late_s < 0.0 { "early" } else { "late" };
+    let (late_ms, std_ms) = (late_s.abs() * 1e3, std_s * 1e3);
+    format!("camera against yaw: pairs are {late_ms:.0} ms {word} (+- {std_ms:.0} ms, {turns} turns)")
 }
 
 fn size_bytes(args: &Args) -> u64 {
@@ -86,7 +108,7 @@ fn with_yaw(recording: &Recording) -> usize {
     recording.survey.iter().filter(|frame| frame.yaw_rad.is_some()).count()
 }
 
-fn as_json(recording: &Recording, size_bytes: u64) -> serde_json::Value {
+fn as_json(recording: &Recording, size_bytes: u64, lag: Option<RecordedLag>) -> serde_json::Value {
     let topics: serde_json::Map<_, _> = recording
         .topics
         .iter()
@@ -118,11 +140,14 @@ fn as_json(recording: &Recording, size_bytes: u64) -> serde_json::Value {
             "latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg, "altitude_m": origin.altitude_m,
         })),
         "calibration": recording.calibration().ok(),
+        "camera_against_yaw": lag.map(|lag| json!({
+            "late_s": lag.late_s, "std_s": lag.std_s, "turns": lag.turns,
+        })),
         "metadata": recording.metadata,
     })
 }
 
-fn as_text(recording: &Recording, size_bytes: u64) -> String {
+fn as_text(recording: &Recording, size_bytes: u64, lag: Option<RecordedLag>) -> String {
     let mut lines: Vec<(String, String)> = Vec::new();
     let mut line = |label: &str, text: String| lines.push((label.into(), printable(&text)));
     line("recording", recording.name.clone());
@@ -162,6 +187,9 @@ fn as_text(recording: &Recording, size_bytes: u64) -> String {
             Err(error) => format!("{:#}", anyhow::Error::new(error)),
         },
     );
+    if let Some(lag) = lag {
+        lines.push(("timing".into(), describe_lag(lag)));
+    }
     let mut text: String = lines.iter().map(|(label, text)| format!("{label:<15}{text}\n")).collect();
 
     let name_width = recording.topics.keys().map(String::len).max().unwrap_or(0).max(5);

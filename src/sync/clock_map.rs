@@ -192,10 +192,10 @@ impl ClockMap {
         let (Some(lowest), Some(before)) = (self.lowest, before) else { return };
         let rise_ns = lowest.key_ns.saturating_sub(before.key_ns);
         if rise_ns > CHANCE_RISE_NS {
-            self.rise_ns += rise_ns;
+            self.rise_ns = self.rise_ns.saturating_add(rise_ns);
             self.jumps += 1;
         } else if rise_ns < 0 {
-            self.rise_ns = (self.rise_ns + rise_ns).max(0);
+            self.rise_ns = self.rise_ns.saturating_add(rise_ns).max(0);
         }
         self.excess_weight = (self.excess_weight + 1.0).min(JITTER_SAMPLES);
         let excess_s = sample.key_ns.saturating_sub(lowest.key_ns) as f64 * 1e-9;
@@ -286,4 +286,98 @@ fn drift_ns(span_ns: i64) -> i64 {
 
 fn signed(ns: u64) -> i64 {
     i64::try_from(ns).unwrap_or(i64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    const LATENCY_NS: i64 = 300_000_000;
+    const RECEIVER_START_NS: i64 = 77_000_000_000;
+    const START_NS: i64 = 500_000_000_000;
+
+    /// Pushes samples of `span_s`, each late by what `late` says; returns the worst error of the envelope \[s\] from the
+    /// 100th sample on.
+    fn run(map: &mut ClockMap, span_s: std::ops::Range<i64>, hz: i64, drift: f64, late: impl Fn(f64) -> f64) -> f64 {
+        let mut worst_s = 0.0f64;
+        for tick in span_s.start * hz..span_s.end * hz {
+            let time_s = tick as f64 / hz as f64;
+            let sample_ns = RECEIVER_START_NS + (time_s * (1.0 - drift) * 1e9) as i64;
+            let taken_ns = START_NS + (time_s * 1e9) as i64;
+            map.push(sample_ns, (taken_ns + LATENCY_NS + (late(time_s) * 1e9) as i64) as u64);
+            let error_ns = map.offset_ns().expect("there are samples") + sample_ns - taken_ns - LATENCY_NS;
+            if tick >= span_s.start * hz + 100 {
+                worst_s = worst_s.max((error_ns as f64 * 1e-9).abs());
+            }
+        }
+        worst_s
+    }
+
+    #[test]
+    fn the_envelope_follows_any_drift_through_jitter() {
+        for (hz, tolerance_s) in [(4, 0.012), (100, 0.004)] {
+            for drift in [-100e-6, -30e-6, 0.0, 30e-6, 100e-6] {
+                let rng = std::cell::RefCell::new(ChaCha8Rng::seed_from_u64(3));
+                let jitter = |_| -0.04 * (1.0 - rng.borrow_mut().random::<f64>()).ln();
+                let mut map = ClockMap::default();
+                let worst_s = run(&mut map, 0..600, hz, drift, jitter);
+                assert!(worst_s < tolerance_s, "{hz} Hz, drift {drift}: {worst_s} s");
+                assert_eq!((map.epoch(), map.jumps()), (0, 0));
+                // What 100 ppm may have done in a window, were they not what the clock does.
+                assert!(map.std_s() < 0.013, "{}", map.std_s());
+                assert!((map.mean_excess_s() - 0.04).abs() < 0.015, "{}", map.mean_excess_s());
+            }
+        }
+    }
+
+    #[test]
+    fn what_a_stalled_line_hands_over_at_once_is_no_step() {
+        let mut map = ClockMap::default();
+        run(&mut map, 0..60, 100, 0.0, |_| 0.0);
+        // From 60 s to 65 s nothing arrives; then all of it.
+        let worst_s = run(&mut map, 60..120, 100, 0.0, |time_s| (65.0 - time_s).max(0.0));
+        assert!(worst_s < 1e-3, "{worst_s}");
+        assert_eq!((map.epoch(), map.steps()), (0, 0));
+    }
+
+    #[test]
+    fn a_frozen_clock_is_never_believed() {
+        let mut map = ClockMap::default();
+        run(&mut map, 0..60, 10, 0.0, |_| 0.0);
+        let last_ns = RECEIVER_START_NS + 60_000_000_000;
+        let verdicts = (0..600)
+            .map(|tick| map.push(last_ns, (START_NS + LATENCY_NS + 62_000_000_000 + tick * 100_000_000) as u64));
+        assert!(verdicts.into_iter().all(|verdict| verdict == Verdict::Undecided));
+    }
+
+    #[test]
+    fn counting_anew_moves_no_sample() {
+        let mut map = ClockMap::default();
+        run(&mut map, 0..10, 10, 0.0, |_| 0.0);
+        let (before_ns, epoch) = (map.offset_ns().expect("samples"), map.epoch());
+        map.recount(1_000_000_007);
+        assert_eq!(map.offset_ns(), Some(before_ns - 1_000_000_007));
+        assert_eq!(map.offset_in_epoch_ns(epoch), Some(before_ns));
+        assert_eq!(map.steps(), 0);
+    }
+
+    proptest! {
+        #[test]
+        fn no_times_can_break_it(pushes in prop::collection::vec((any::<i64>(), any::<u64>(), 0..6u8), 0..200)) {
+            let mut map = ClockMap::default();
+            for (sample_ns, arrival_ns, what) in pushes {
+                match what {
+                    0 => map.recount(sample_ns),
+                    1 => drop((0..8).map(|i| map.push(sample_ns, arrival_ns.saturating_add(i << 28))).count()),
+                    _ => drop(map.push(sample_ns, arrival_ns)),
+                }
+                prop_assert!(map.std_s() >= 0.0);
+                map.offset_at_ns(arrival_ns);
+            }
+        }
+    }
 }

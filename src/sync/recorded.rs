@@ -21,8 +21,8 @@ const MIN_HEADING_HZ: f64 = 5.0;
 const MAX_HEADING_HZ: f64 = 50.0;
 /// Pieces with turns that are looked at, spread over the drive.
 const PIECES: usize = 8;
-/// Frames looked at: one in so many seconds, 12 a second.
-const FRAME_INTERVAL_S: f64 = 0.08;
+/// Frames looked at: one in so many seconds, every second one of 30 a second.
+const FRAME_INTERVAL_S: f64 = 0.06;
 
 /// By how much pairs and pictures disagree.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -138,6 +138,8 @@ struct CameraYaw {
     pieces: Vec<Vec<YawPoint>>,
     frames: usize,
     last_s: f64,
+    /// The newest frame of a record.
+    last_ns: u64,
 }
 
 impl CameraYaw {
@@ -151,6 +153,7 @@ impl CameraYaw {
             tracker: RotationTracker::new(calibration.azimuth),
             frames: 0,
             last_s: f64::NEG_INFINITY,
+            last_ns: 0,
         }
     }
 
@@ -180,16 +183,111 @@ impl CameraYaw {
         let rotation = self.tracker.push(stamp_ns, &self.panorama);
         let piece = &mut self.pieces[index];
         match (piece.last(), rotation) {
-            (Some(&(_, yaw_rad)), Some(rotation)) => piece.push((stamp_s, yaw_rad + rotation.rotation_rad)),
-            // Where a rotation is missing, the yaw is not known from there on: the piece begins anew.
-            _ => {
-                piece.clear();
-                piece.push((stamp_s, 0.0));
+            (None, _) => piece.push((stamp_s, 0.0)),
+            (Some(&(_, yaw_rad)), Some(rotation)) if rotation.from_ns == self.last_ns => {
+                piece.push((stamp_s, yaw_rad + rotation.rotation_rad));
             }
+            // The tracker gave up on frames in between: the yaw is not known from there on, and the piece begins anew
+            // with the frame that it went on from.
+            (Some(_), Some(rotation)) => {
+                piece.clear();
+                piece.push((rotation.from_ns as f64 * 1e-9, 0.0));
+                piece.push((stamp_s, rotation.rotation_rad));
+            }
+            (Some(_), None) => return,
         }
+        self.last_ns = stamp_ns;
     }
 
     fn finish(self) -> Vec<Vec<YawPoint>> {
         self.pieces
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{f64::consts::TAU, fs, io::Cursor};
+
+    use super::*;
+    use crate::{recording::RecordingWriter, types::wrap_angle_rad};
+
+    const DONUT: &str = r#"{"kind": "donut", "cx": 79.5, "cy": 79.5, "r_in": 20.0, "r_out": 76.0, "top_is_outer": true,
+        "start_angle": 0.4, "clockwise": true, "azimuth": "cw"}"#;
+    const SIZE_PX: usize = 160;
+
+    /// A right-angled turn of 4 s, one in 12 s.
+    fn yaw_rad(time_s: f64) -> f64 {
+        let turns = (time_s / 12.0).floor();
+        let within = ((time_s - 12.0 * turns - 4.0) / 4.0).clamp(0.0, 1.0);
+        TAU / 4.0 * (turns + within - (TAU * within).sin() / TAU)
+    }
+
+    /// The surroundings, at so many azimuths.
+    fn surroundings() -> Vec<f64> {
+        let waves = [(3.0, 0.0), (5.0, 1.0), (7.0, 4.0), (8.0, 2.5), (11.0, 0.3), (13.0, 5.0), (17.0, 1.7)];
+        let shade = |azimuth_rad: f64| {
+            128.0 + waves.map(|(k, phase)| 14.0 * (k * azimuth_rad + phase).cos()).iter().sum::<f64>()
+        };
+        (0..8192).map(|i| shade(TAU * f64::from(i) / 8192.0)).collect()
+    }
+
+    /// As a donut camera sees them at a yaw.
+    fn picture(surroundings: &[f64], yaw_rad: f64) -> Vec<u8> {
+        let count = surroundings.len() as f64;
+        let shade = |x: usize, y: usize| {
+            let (dx, dy) = (x as f64 - 79.5, y as f64 - 79.5);
+            // Columns run clockwise from the start angle, and the azimuth falls with them.
+            let azimuth_rad = yaw_rad - (dy.atan2(dx) - 0.4);
+            surroundings[((azimuth_rad / TAU).rem_euclid(1.0) * count) as usize % surroundings.len()] as u8
+        };
+        let pixels: Vec<u8> = (0..SIZE_PX * SIZE_PX).map(|i| shade(i % SIZE_PX, i / SIZE_PX)).collect();
+        let mut jpeg = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 80)
+            .encode(&pixels, SIZE_PX as u32, SIZE_PX as u32, image::ExtendedColorType::L8)
+            .expect("encodes");
+        jpeg
+    }
+
+    /// A drive of 60 s whose headings are stamped too late.
+    fn record(path: &Path, heading_hz: u32, late_s: f64) {
+        let mut recording = RecordingWriter::new(Cursor::new(Vec::new())).expect("starts");
+        recording.attach("donut.json", "application/json", 0, DONUT.as_bytes()).expect("attaches");
+        let start_ns = 1_000_000_000_000u64;
+        let ns = |time_s: f64| start_ns + (time_s * 1e9) as u64;
+        for i in 0..60 * heading_hz {
+            let time_s = f64::from(i) / f64::from(heading_hz);
+            let yaw_rad = wrap_angle_rad(yaw_rad(time_s));
+            let heading = omniloc::Heading { timestamp: None, yaw_rad, source: "HDT".into(), yaw_std_rad: None };
+            recording.write(&topics::GNSS_HEADING, i, ns(time_s + late_s), &heading).expect("writes");
+        }
+        let surroundings = surroundings();
+        for frame in 0..600 {
+            let time_s = f64::from(frame) / 10.0;
+            recording.write_image(frame, ns(time_s), picture(&surroundings, yaw_rad(time_s))).expect("writes");
+        }
+        fs::write(path, recording.finish().expect("finishes").into_inner()).expect("writes");
+    }
+
+    #[test]
+    fn a_recording_shows_by_how_much_pairs_and_pictures_disagree() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("drive.mcap");
+        for late_s in [0.12, -0.035] {
+            record(&path, 20, late_s);
+            let recording = Recording::open_any(&path).expect("sound");
+            let mut decoded = 0;
+            let lag = latency_from_recording(&recording, |frame, of| {
+                decoded = frame;
+                assert!(of <= 1100);
+            });
+            let lag = lag.expect("sound").expect("turns enough");
+            println!("headings {late_s} s late: {lag:?}, {decoded} frames");
+            assert!((lag.late_s - late_s).abs() < 0.005 && lag.std_s < 0.01, "{lag:?}");
+            assert!(lag.turns >= 4 && decoded < 600);
+        }
+        record(&path, 1, 0.0);
+        let recording = Recording::open_any(&path).expect("sound");
+        let lag = latency_from_recording(&recording, |_, _| panic!("nothing to look at"));
+        assert_eq!(lag.expect("sound"), None, "a yaw a second says nothing");
     }
 }

@@ -20,11 +20,18 @@ const HARMONICS: usize = WIDE_COLUMNS / 2 + 1;
 /// Slower harmonics are light and sky, faster ones noise.
 const USED: std::ops::Range<usize> = 4..160;
 /// The correlation of the two frames, 1 for equal ones, must be at least this.
-const MIN_QUALITY: f64 = 0.5;
+const MIN_QUALITY: f64 = 0.4;
 /// And this many times the highest one elsewhere: repeated windows look alike.
-const MIN_LEAD: f64 = 1.1;
+const MIN_LEAD: f64 = 1.05;
 /// "Elsewhere" begins this far from the peak \[columns\].
 const PEAK_COLUMNS: usize = 12;
+/// A frame that does not show its rotation is passed over and the next compared with the one before it, so many times:
+/// glare or a bus beside the vehicle must not break the chain.
+const MAX_PASSED_OVER: u32 = 2;
+/// Rings are judged by turns of at least two columns: on the straight, the vehicle's own roof fits best of all.
+const LEARNING_SHIFT_RAD: f64 = 2.0 * TAU / WIDE_COLUMNS as f64;
+/// Share of the newest turn in what is known of a ring.
+const LEARNING_RATE: f64 = 0.1;
 /// Steps of Newton's method from the highest column to the peak; two are enough.
 const NEWTON_STEPS: usize = 3;
 
@@ -45,8 +52,11 @@ pub struct VisualRotation {
 /// the slow and the very fast harmonics, the correlation at a shift of s columns is
 ///
 /// ```text
-/// c(s) = Σᵣ Σₖ Re(Aᵣₖ* Bᵣₖ e^{2πi k s / W}) / √(Σ|A|² Σ|B|²)
+/// c(s) = Σᵣ wᵣ Σₖ Re(Aᵣₖ* Bᵣₖ e^{2πi k s / W}) / √(Σ w|A|² Σ w|B|²)
 /// ```
+///
+/// Rings around the horizon see what is far away, rings below and above it the road and façades that pass by, or the
+/// vehicle itself. Which is which is learnt: w is the fourth power of a ring's own mean correlation in turns.
 ///
 /// Its highest column comes from one inverse transform, its peak between columns from Newton's method on the sum itself,
 /// which is exact: no error that depends on where between two columns the peak lies.
@@ -59,7 +69,11 @@ pub struct RotationTracker {
     spectrum: Vec<Complex<f64>>,
     correlation: Vec<f64>,
     scratch: Vec<Complex<f64>>,
+    /// How well each ring fits the turns that were found, and what that makes it count.
+    agreement: [f64; RINGS],
+    weights: [f64; RINGS],
     before: Option<Profile>,
+    passed_over: u32,
     spare: Option<Profile>,
 }
 
@@ -67,7 +81,7 @@ pub struct RotationTracker {
 struct Profile {
     stamp_ns: u64,
     spectra: Vec<Complex<f64>>,
-    energy: f64,
+    energies: [f64; RINGS],
 }
 
 impl RotationTracker {
@@ -86,32 +100,45 @@ impl RotationTracker {
             scratch: vec![Complex::ZERO; scratch_length],
             forward,
             inverse,
+            agreement: [1.0; RINGS],
+            weights: [1.0; RINGS],
             before: None,
+            passed_over: 0,
             spare: None,
         }
     }
 
-    /// The rotation since the frame before. `None`: there was none, or the two do not show it.
+    /// The rotation since the frame before, or the one before that if that one was passed over. `None`: there was none,
+    /// or the two do not show it.
     pub fn push(&mut self, stamp_ns: u64, panorama: &Panorama) -> Option<VisualRotation> {
         let mut profile = self.spare.take().unwrap_or_else(Profile::zeros);
         self.describe(stamp_ns, panorama, &mut profile);
         let before = self.before.take();
         let rotation = before.as_ref().and_then(|before| self.between(before, &profile));
-        self.spare = before;
-        self.before = Some(profile);
+        if rotation.is_none() && before.is_some() && self.passed_over < MAX_PASSED_OVER {
+            self.passed_over += 1;
+            (self.before, self.spare) = (before, Some(profile));
+        } else {
+            // Who was given up on is not trusted for long either.
+            if rotation.is_some() {
+                self.passed_over = 0;
+            }
+            (self.before, self.spare) = (Some(profile), before);
+        }
         rotation
     }
 
     /// The next frame has none before it.
     pub fn restart(&mut self) {
+        self.passed_over = 0;
         self.spare = self.before.take().or(self.spare.take());
     }
 
     fn describe(&mut self, stamp_ns: u64, panorama: &Panorama, profile: &mut Profile) {
         profile.stamp_ns = stamp_ns;
-        profile.energy = 0.0;
         let rings = panorama.wide.chunks_exact(WIDE_COLUMNS * ROWS_PER_RING);
-        for (rows, spectrum) in rings.zip(profile.spectra.chunks_exact_mut(USED.len())) {
+        let spectra = profile.spectra.chunks_exact_mut(USED.len());
+        for (rows, (spectrum, energy)) in rings.zip(spectra.zip(&mut profile.energies)) {
             self.ring.fill(0.0);
             for row in rows.chunks_exact(WIDE_COLUMNS) {
                 self.ring.iter_mut().zip(row).for_each(|(sum, &value)| *sum += f64::from(value));
@@ -120,19 +147,23 @@ impl RotationTracker {
                 .process_with_scratch(&mut self.ring, &mut self.spectrum, &mut self.scratch)
                 .expect("the buffers come from the plan");
             spectrum.copy_from_slice(&self.spectrum[USED]);
-            profile.energy += spectrum.iter().map(Complex::norm_sqr).sum::<f64>();
+            *energy = spectrum.iter().map(Complex::norm_sqr).sum();
         }
     }
 
     fn between(&mut self, from: &Profile, to: &Profile) -> Option<VisualRotation> {
-        let scale = (from.energy * to.energy).sqrt();
+        let weighted = |profile: &Profile| -> f64 {
+            self.weights.iter().zip(&profile.energies).map(|(weight, energy)| weight * energy).sum()
+        };
+        let scale = (weighted(from) * weighted(to)).sqrt();
         if !(scale > 0.0 && scale.is_finite()) {
             return None;
         }
         self.cross.fill(Complex::ZERO);
         let used = &mut self.cross[USED];
-        for (a, b) in from.spectra.chunks_exact(USED.len()).zip(to.spectra.chunks_exact(USED.len())) {
-            used.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum += a.conj() * b / scale);
+        for (weight, (a, b)) in self.weights.iter().zip(rings(from).zip(rings(to))) {
+            let factor = weight / scale;
+            used.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum += a.conj() * b * factor);
         }
         let mut spectrum = std::mem::take(&mut self.spectrum);
         spectrum.copy_from_slice(&self.cross);
@@ -154,6 +185,7 @@ impl RotationTracker {
             return None;
         }
         let shift_rad = self.peak_near_rad(TAU * column as f64 / WIDE_COLUMNS as f64);
+        self.learn_weights(from, to, shift_rad);
         // What the vehicle turns towards moves to lower columns where the azimuth grows with the column.
         let rotation_rad = match self.azimuth {
             AzimuthSense::Ccw => -shift_rad,
@@ -161,6 +193,27 @@ impl RotationTracker {
         };
         let rotation_rad = wrap_angle_rad(rotation_rad);
         Some(VisualRotation { from_ns: from.stamp_ns, to_ns: to.stamp_ns, rotation_rad, quality })
+    }
+
+    /// Rings that show the turn well get more weight.
+    fn learn_weights(&mut self, from: &Profile, to: &Profile, shift_rad: f64) {
+        if shift_rad.abs() < LEARNING_SHIFT_RAD {
+            return;
+        }
+        let step = Complex::from_polar(1.0, shift_rad);
+        let first = Complex::from_polar(1.0, shift_rad * USED.start as f64);
+        for (ring, (a, b)) in rings(from).zip(rings(to)).enumerate() {
+            let scale = (from.energies[ring] * to.energies[ring]).sqrt();
+            let mut turn = first;
+            let mut product = 0.0;
+            for (a, b) in a.iter().zip(b) {
+                product += (a.conj() * b * turn).re;
+                turn *= step;
+            }
+            let agreement = if scale > 0.0 { (product / scale).clamp(0.0, 1.0) } else { 0.0 };
+            self.agreement[ring] += LEARNING_RATE * (agreement - self.agreement[ring]);
+            self.weights[ring] = self.agreement[ring].powi(4);
+        }
     }
 
     /// The maximum of Σ Re(cross e^{i k s}) next to `start_rad`.
@@ -186,9 +239,14 @@ impl RotationTracker {
     }
 }
 
+/// The spectrum of each ring.
+fn rings(profile: &Profile) -> std::slice::ChunksExact<'_, Complex<f64>> {
+    profile.spectra.chunks_exact(USED.len())
+}
+
 impl Profile {
     fn zeros() -> Self {
-        Self { stamp_ns: 0, spectra: vec![Complex::ZERO; RINGS * USED.len()], energy: 0.0 }
+        Self { stamp_ns: 0, spectra: vec![Complex::ZERO; RINGS * USED.len()], energies: [0.0; RINGS] }
     }
 }
 
@@ -239,23 +297,33 @@ mod tests {
     #[test]
     fn what_does_not_show_a_turn_is_refused() {
         let azimuth = AzimuthSense::Ccw;
-        let mut tracker = RotationTracker::new(azimuth);
         let plain = Panorama::from_wide(vec![90.0; WIDE_COLUMNS * WIDE_ROWS]);
         let noise = |seed| seen(azimuth, 0.0, 5000.0, seed);
-        tracker.push(0, &plain);
-        assert_eq!(tracker.push(1, &plain), None, "nothing to see");
-        assert_eq!(tracker.push(2, &seen(azimuth, 0.0, 1.0, 0)), None, "nothing before");
-        tracker.push(3, &noise(1));
-        assert_eq!(tracker.push(4, &noise(2)), None, "noise");
+        let landscape = || seen(azimuth, 0.0, 1.0, 0);
         let striped = |j: usize| if (j / 8).is_multiple_of(2) { 50.0 } else { 150.0 };
         let stripes = Panorama::from_wide((0..WIDE_COLUMNS * WIDE_ROWS).map(striped).collect());
-        tracker.push(5, &stripes);
-        assert_eq!(tracker.push(6, &stripes), None, "it could be any of 32 turns");
         let broken = Panorama::from_wide(vec![f32::NAN; WIDE_COLUMNS * WIDE_ROWS]);
-        tracker.push(7, &broken);
-        assert_eq!(tracker.push(8, &broken), None);
-        tracker.push(9, &seen(azimuth, 0.0, 1.0, 0));
+        let mut tracker = RotationTracker::new(azimuth);
+        for (what, before, after) in [
+            ("nothing to see", &plain, &plain),
+            ("nothing before", &plain, &landscape()),
+            ("noise", &noise(1), &noise(2)),
+            ("it could be any of 32 turns", &stripes, &stripes),
+            ("not numbers", &broken, &broken),
+        ] {
+            tracker.restart();
+            assert_eq!(tracker.push(0, before), None);
+            assert_eq!(tracker.push(1, after), None, "{what}");
+        }
         tracker.restart();
-        assert_eq!(tracker.push(10, &seen(azimuth, 0.0, 1.0, 0)), None, "told to begin anew");
+        assert_eq!(tracker.push(2, &landscape()), None, "told to begin anew");
+        for stamp_ns in 3..5 {
+            assert_eq!(tracker.push(stamp_ns, &plain), None, "glare");
+        }
+        let found = tracker.push(5, &landscape()).expect("the glare is over");
+        assert_eq!((found.from_ns, found.to_ns), (2, 5));
+        (6..9).for_each(|stamp_ns| assert_eq!(tracker.push(stamp_ns, &plain), None));
+        assert_eq!(tracker.push(9, &landscape()), None, "too long ago");
+        assert!(tracker.push(10, &landscape()).is_some());
     }
 }

@@ -27,6 +27,8 @@ const GAIN: std::ops::RangeInclusive<f64> = 0.6..=1.5;
 /// Neighbouring residuals resemble each other, so that there are fewer of them than it seems: the factor on the
 /// deviation, of which the tests show that it is not too small.
 const RESIDUAL_FACTOR: f64 = 2.5;
+/// No lag is known better than frames and headings are stamped.
+const MIN_STD_S: f64 = 0.001;
 /// A lag with a larger deviation is not worth more than none.
 const MAX_STD_S: f64 = 0.06;
 
@@ -123,7 +125,7 @@ impl YawLag {
         if correlation_squared < MIN_CORRELATION * MIN_CORRELATION || !GAIN.contains(&all.gain) {
             return None;
         }
-        let std_s = all.std_s().max(spread_s(&pieces, &all));
+        let std_s = all.std_s().max(spread_s(&pieces, &all)).max(MIN_STD_S);
         (std_s <= MAX_STD_S).then_some(LagEstimate { lag_s: all.lag_s, std_s, turns: pieces.len() })
     }
 }
@@ -246,4 +248,66 @@ fn sampled(record: &[YawPoint], times: impl Iterator<Item = f64>) -> Vec<f64> {
         if t1 > t0 { y0 + (y1 - y0) * ((t - t0) / (t1 - t0)) } else { y1 }
     };
     times.map(at).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn yaw_rad(time_s: f64) -> f64 {
+        // Right-angled turns of 4 s, one in 8 s, to the left and to the right.
+        let turn = (time_s / PIECE_S).floor();
+        let within = ((time_s - turn * PIECE_S - 2.0) / 4.0).clamp(0.0, 1.0);
+        let size_rad = if turn.rem_euclid(2.0) == 0.0 { 1.57 } else { -1.57 };
+        let before_rad = if turn.rem_euclid(2.0) == 0.0 { 0.0 } else { 1.57 };
+        3.0 + before_rad + size_rad * (within - (TAU * within).sin() / TAU)
+    }
+
+    fn record(from_s: f64, to_s: f64, hz: f64, delay_s: f64) -> Vec<YawPoint> {
+        let ticks = (from_s * hz) as i64..=(to_s * hz) as i64;
+        ticks.map(|i| i as f64 / hz).map(|t| (t, wrap_angle_rad(yaw_rad(t - delay_s)))).collect()
+    }
+
+    fn lag(pieces: usize, delay_s: f64, gain: f64) -> Option<LagEstimate> {
+        let mut lag = YawLag::default();
+        let receiver = record(0.0, 200.0, 100.0, delay_s);
+        for piece in 0..pieces {
+            let start_s = 8.0 * (piece + 1) as f64;
+            let mut camera = record(start_s, start_s + PIECE_S, 15.0, 0.0);
+            let angles = unwrapped(camera.iter().map(|point| point.1));
+            camera.iter_mut().zip(angles).for_each(|(point, angle)| point.1 = gain * angle);
+            lag.push(Piece::compare(&camera, &receiver)?);
+        }
+        lag.estimate()
+    }
+
+    #[test]
+    fn the_lag_is_found_between_its_steps() {
+        for delay_s in [-0.73, -0.2, 0.0, 0.007, 0.31, 0.333, 0.9] {
+            for (pieces, gain) in [(1, 1.0), (6, 0.9), (6, 1.2)] {
+                let found = lag(pieces, delay_s, gain).expect("turns enough");
+                assert!((found.lag_s - delay_s).abs() < 1e-3, "{found:?}, truth {delay_s}");
+                assert!(found.std_s < 0.005 && found.turns == pieces);
+            }
+        }
+    }
+
+    #[test]
+    fn no_lag_is_found_where_the_yaws_disagree() {
+        assert_eq!(lag(0, 0.1, 1.0), None, "no turns");
+        assert_eq!(lag(4, 0.1, -1.0), None, "the camera turns the other way");
+        assert_eq!(lag(4, 0.1, 3.0), None, "three times as much");
+        assert_eq!(lag(4, 1.5, 1.0), None, "too far apart to be tried");
+    }
+
+    #[test]
+    fn a_piece_needs_a_turn_and_a_yaw_without_holes() {
+        let camera = record(8.0, 16.0, 15.0, 0.0);
+        assert!(Piece::compare(&camera, &record(0.0, 30.0, 100.0, 0.0)).is_some());
+        assert!(Piece::compare(&camera, &record(8.0, 30.0, 100.0, 0.0)).is_none(), "does not begin early enough");
+        assert!(Piece::compare(&camera, &record(0.0, 30.0, 2.0, 0.0)).is_none(), "too far between");
+        let straight: Vec<YawPoint> = (0..3000).map(|i| (f64::from(i) / 100.0, 1.0)).collect();
+        assert!(Piece::compare(&camera, &straight).is_none(), "the vehicle went straight on");
+        assert!(Piece::compare(&camera[..10], &record(0.0, 30.0, 100.0, 0.0)).is_none(), "too few frames");
+    }
 }
