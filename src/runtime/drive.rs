@@ -13,7 +13,7 @@ use crate::{
         gpio::{self, Led, SimulatedPins},
         pty::{Pace, Pty, TimedBytes},
         replay::{self, ReplayCamera},
-        simulated::{DATE_STEP_NS, FaultKind, Simulation},
+        simulated::{self, DATE_STEP_NS, FaultKind, Simulation},
     },
     recording::{
         DeviceRecord, DeviceRecords, Recording,
@@ -22,6 +22,7 @@ use crate::{
         topics,
     },
     types::{Clock, ClockReading, DonutCalibration, NS_PER_S, ScaledClock, SystemClock},
+    world::World,
 };
 
 /// Where the clocks of a simulated drive start: a computer that was switched on a while ago.
@@ -32,7 +33,7 @@ const SIMULATED_LEAD_NS: u64 = NS_PER_S / 2;
 
 /// Records a drive as `config` says, until it is told to stop or its devices end; `each_second` is told the status.
 pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) -> anyhow::Result<DriveReport> {
-    let world = config.simulation.as_ref().map(|settings| settings.world());
+    let simulated = config.simulation.as_ref().map(simulate);
     let start = match (&config.simulation, replayed(config)) {
         (Some(_), _) => Some(SIMULATED_START),
         (None, Some(path)) => Some(first_clocks(path)?),
@@ -43,14 +44,10 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
     if let (None, Some(path)) = (&calibration, replayed(config)) {
         calibration = Recording::open_any(path)?.calibration_json().map(<[u8]>::to_vec);
     }
-    let simulation = match (&config.simulation, &world) {
-        (Some(settings), Some(world)) => {
-            calibration.get_or_insert_with(|| calibration_json(&settings.camera().donut));
-            let start_ns = SIMULATED_START.monotonic_ns + (SIMULATED_LEAD_NS as f64 * speed.max(1.0)) as u64;
-            Some((Simulation::new(settings, world, start_ns, SIMULATED_START.realtime_ns), world))
-        }
-        _ => None,
-    };
+    let simulation = simulated.as_ref().map(|(simulation, world)| (simulation.clone(), world));
+    if let Some((simulation, _)) = &simulation {
+        calibration.get_or_insert_with(|| calibration_json(&simulation.settings.camera().donut));
+    }
 
     // A camera renders its world first, which takes a while: the clocks start when it is ready.
     let mut camera = simulated_camera(config, simulation.as_ref())?;
@@ -96,9 +93,16 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
     report
 }
 
+/// The world of a simulated drive, and the truth of what happens in it.
+pub fn simulate(settings: &simulated::Settings) -> (Simulation, World) {
+    let world = settings.world();
+    let start_ns = SIMULATED_START.monotonic_ns + (SIMULATED_LEAD_NS as f64 * settings.speed.max(1.0)) as u64;
+    (Simulation::new(settings, &world, start_ns, SIMULATED_START.realtime_ns), world)
+}
+
 fn simulated_camera(
     config: &RecordConfig,
-    simulation: Option<&(Simulation, &crate::world::World)>,
+    simulation: Option<&(Simulation, &World)>,
 ) -> anyhow::Result<Option<DeviceRun<CameraEvent>>> {
     let (Camera::Simulated, Some((simulation, world))) = (&config.camera, simulation) else { return Ok(None) };
     let mut camera = simulation.camera(world)?;
@@ -122,7 +126,7 @@ fn real_or_replayed_camera(config: &RecordConfig) -> anyhow::Result<Option<Devic
 /// The serial line, and the thread that plays a simulated or replayed receiver into it.
 fn gnss(
     config: &RecordConfig,
-    simulation: Option<&(Simulation, &crate::world::World)>,
+    simulation: Option<&(Simulation, &World)>,
     ports: &Path,
     clock: &Arc<dyn Clock>,
     stop: &Stop,

@@ -52,8 +52,10 @@ pub struct StatusCounter {
     frames_this_second: u32,
     fixes_this_second: u32,
     headings_this_second: u32,
-    /// Bytes came, but no fix: the receiver is well and sees no satellites.
+    /// Bytes came that say something, but no fix: the receiver is well and sees no satellites.
     searching: bool,
+    /// When bytes came last, whatever they say.
+    last_bytes_ns: Option<u64>,
     last_second_ns: u64,
     newest_ns: u64,
 }
@@ -101,7 +103,9 @@ impl StatusCounter {
         }
     }
 
-    pub fn bytes(&mut self, count: usize) {
+    pub fn bytes(&mut self, arrival_ns: u64, count: usize) {
+        self.newest_ns = self.newest_ns.max(arrival_ns);
+        self.last_bytes_ns = Some(arrival_ns);
         self.status.serial_bytes += count as u64;
     }
 
@@ -114,7 +118,8 @@ impl StatusCounter {
         self.status.position_std_m = fix.position_std_m.map(|[east_m, north_m, _]| east_m.max(north_m));
     }
 
-    pub fn no_fix(&mut self) {
+    pub fn no_fix(&mut self, arrival_ns: u64) {
+        self.gnss.heard(arrival_ns);
         self.searching = true;
     }
 
@@ -136,16 +141,24 @@ impl StatusCounter {
         tick.clocks.map_or(self.newest_ns, |clocks| clocks.monotonic_ns)
     }
 
+    fn gnss_health(&self, now_ns: u64) -> &'static str {
+        match self.gnss.health(now_ns) {
+            "ok" if self.searching => "no fix",
+            "silent" | "waiting" if self.last_bytes_ns.is_some_and(|last_ns| last_ns + HEARD_NS >= now_ns) => "unreadable",
+            health => health,
+        }
+    }
+
     /// Closes the second.
     pub fn second(&mut self, tick: &Tick, latency: LatencyEstimate, serial: &DecoderCounters) -> &Status {
         let now_ns = self.now_ns(tick);
         let span_s = now_ns.saturating_sub(self.last_second_ns) as f64 * 1e-9;
         let per_second = |count: &mut u32| if span_s > 0.0 { f64::from(std::mem::take(count)) / span_s } else { 0.0 };
         let SystemStatus { cpu_cores, resident_bytes, temperature_celsius, throttled } = tick.system;
-        let gnss_health = self.gnss.health(now_ns);
+        let gnss_health = self.gnss_health(now_ns);
         self.status = Status {
             camera_health: self.camera.health(now_ns).into(),
-            gnss_health: if self.searching && gnss_health != "stopped" { "no fix" } else { gnss_health }.into(),
+            gnss_health: gnss_health.into(),
             disk_health: tick.recorder.disk.into(),
             camera_fps: per_second(&mut self.frames_this_second),
             camera_restarts: self.camera.opened.saturating_sub(1),

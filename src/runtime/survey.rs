@@ -182,7 +182,7 @@ impl Survey {
             baud: chunk.baud,
         };
         out.push(self.encoder.message(&topics::GNSS_RAW, 0, chunk.arrival_ns, &raw));
-        self.status.bytes(chunk.bytes.len());
+        self.status.bytes(chunk.arrival_ns, chunk.bytes.len());
 
         let mut samples = std::mem::take(&mut self.samples);
         self.decoder.push(chunk, &mut samples);
@@ -208,7 +208,7 @@ impl Survey {
                 let message = self.heading_message(heading, stamp_ns);
                 out.push(self.encoder.message(&topics::GNSS_HEADING, 0, stamp_ns, &message));
             }
-            GnssSample::NoFix { .. } => self.status.no_fix(),
+            GnssSample::NoFix { arrival_ns, .. } => self.status.no_fix(*arrival_ns),
             GnssSample::Rejected { arrival_ns, reason } => {
                 let lost = Lost { count: 1, reason, stamp_ns: *arrival_ns };
                 self.lost(&topics::GNSS_FIX, &lost, out);

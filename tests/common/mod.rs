@@ -72,6 +72,10 @@ impl TinyDataset {
     }
 }
 
+pub fn omniloc_path() -> PathBuf {
+    env!("CARGO_BIN_EXE_omniloc").into()
+}
+
 pub fn omniloc() -> Command {
     Command::new(env!("CARGO_BIN_EXE_omniloc"))
 }
