@@ -106,15 +106,18 @@ fn describe(error: &DeviceError) -> String {
 fn shim() -> &'static Path {
     static SHIM: OnceLock<PathBuf> = OnceLock::new();
     SHIM.get_or_init(|| {
-        let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("v4l2_shim-{}.so", std::process::id()));
+        let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join("v4l2_shim.so");
+        // Another run of this program may be using the library: a new one is put in its place whole.
+        let compiling = library.with_extension(std::process::id().to_string());
         let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/v4l2_shim/shim.c");
         let compiled = Command::new("cc")
             .args(["-shared", "-fPIC", "-O1", "-Wall", "-Wextra", "-Werror", "-o"])
-            .args([library.as_path(), Path::new(source)])
+            .args([compiling.as_path(), Path::new(source)])
             .args(["-ldl", "-lpthread"])
             .status()
             .expect("cc runs");
         assert!(compiled.success());
+        fs::rename(&compiling, &library).expect("renames");
         library
     })
 }
