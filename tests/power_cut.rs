@@ -51,8 +51,20 @@ fn drive_until_cut(disk: &Disk, frames: u32, frame_bytes: usize) -> (Drive, bool
     (drive, is_dead)
 }
 
+/// Says which seed it was when a check far below fails.
+struct Seed(u64);
+
+impl Drop for Seed {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("it was seed {}", self.0);
+        }
+    }
+}
+
 /// One power cut somewhere in a drive of two to four seconds, perhaps one more while the cut segments are mended.
 fn cut_once(seed: u64) {
+    let _seed = Seed(seed);
     let mut random = random(seed);
     let frames = random.random_range(30..130);
     let frame_bytes = pick(&mut random, &[600, 3000, 20_000]);

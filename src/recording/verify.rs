@@ -30,7 +30,7 @@ pub struct Verdict {
     pub messages: u64,
     pub images: u64,
     pub pairs: u64,
-    /// The file is whole, and its indexes agree with what is in it. Contents may still have problems.
+    /// No byte is missing or damaged, and the indexes agree with what is there. Contents may still have problems.
     pub is_complete: bool,
 }
 
@@ -91,6 +91,8 @@ fn verify_opened(path: &Path, file: Result<RecordFile, RecordingError>) -> Resul
 struct Check {
     verdict: Verdict,
     was_cut: bool,
+    /// A CRC does not fit, or a record cannot be parsed.
+    is_damaged: bool,
     channels: Channels,
     topics: BTreeMap<String, TopicSummary>,
     unknown_schemas: BTreeSet<String>,
@@ -119,6 +121,7 @@ struct Check {
 impl Check {
     fn read_top_record(&mut self, opcode: u8, offset: u64, body: &[u8], section_fault: Option<String>) {
         if let Some(fault) = section_fault {
+            self.is_damaged = true;
             self.verdict.problem(format!("byte {offset}: {fault}"));
         }
         if opcode == op::CHUNK {
@@ -126,7 +129,10 @@ impl Check {
             return;
         }
         match parse(opcode, body) {
-            Err(fault) => self.verdict.problem(format!("byte {offset}: {fault}")),
+            Err(fault) => {
+                self.is_damaged = true;
+                self.verdict.problem(format!("byte {offset}: {fault}"));
+            }
             Ok(Record::Attachment { header, data, .. }) => {
                 self.attachments.insert(offset);
                 if header.name == topics::CALIBRATION_ATTACHMENT {
@@ -176,6 +182,7 @@ impl Check {
             Ok(())
         });
         if let Err(fault) = outcome {
+            self.is_damaged = true;
             self.verdict.problem(format!("chunk at byte {offset}: {fault}"));
         }
         self.chunks.insert(offset, times);
@@ -272,7 +279,8 @@ impl Check {
             let problems = self.verdict.problems.len() as u64 + self.verdict.unlisted_problems;
             self.compare_with_statistics();
             self.compare_with_indexes();
-            self.verdict.is_complete = self.verdict.problems.len() as u64 + self.verdict.unlisted_problems == problems;
+            let agrees = self.verdict.problems.len() as u64 + self.verdict.unlisted_problems == problems;
+            self.verdict.is_complete = agrees && !self.is_damaged;
         }
         let imageless = self.pairs.difference(&self.images).count();
         if imageless > 0 {
