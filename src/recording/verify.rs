@@ -114,6 +114,9 @@ struct Check {
     invalid_pairs: u64,
     /// Without Huffman tables.
     incomplete_images: u64,
+    /// The next image was damaged when it was recorded: a loss with its stamp says so.
+    known_damage_ns: Option<u64>,
+    damaged_images: u64,
     /// The recording itself says that something is missing from it.
     states_losses: bool,
 }
@@ -219,10 +222,14 @@ impl Check {
             "omniloc.Heading" => drop(omniloc::Heading::decode(data).map_err(wrong)?),
             "omniloc.SerialChunk" => drop(omniloc::SerialChunk::decode(data).map_err(wrong)?),
             "omniloc.ClockOffset" => drop(omniloc::ClockOffset::decode(data).map_err(wrong)?),
+            "omniloc.Pulse" => drop(omniloc::Pulse::decode(data).map_err(wrong)?),
             "omniloc.Status" => drop(omniloc::Status::decode(data).map_err(wrong)?),
             "omniloc.Dropped" => {
-                omniloc::Dropped::decode(data).map_err(wrong)?;
+                let dropped = omniloc::Dropped::decode(data).map_err(wrong)?;
                 self.states_losses = true;
+                if dropped.topic == topics::CAMERA_IMAGE.name {
+                    self.known_damage_ns = Some(header.publish_time);
+                }
             }
             other => drop(self.unknown_schemas.insert(format!("{} ({other})", channel.topic))),
         }
@@ -247,6 +254,10 @@ impl Check {
             && (sequence < last || header.publish_time < last_ns)
         {
             return Err(format!("image {sequence} is before image {last} in number or time, but after it in the file"));
+        }
+        if self.known_damage_ns.take() == Some(header.publish_time) {
+            self.damaged_images += 1;
+            return Ok(());
         }
         let info = jpeg::scan(&image.data).map_err(|fault| format!("image {sequence}: {fault}"))?;
         let size_px = (info.width_px, info.height_px);
@@ -298,6 +309,7 @@ impl Check {
             }
         };
         note(pairless as u64, "images have no survey pair and are not used for training");
+        note(self.damaged_images, "images were damaged when they were recorded, as /dropped says");
         note(self.incomplete_images, "images have no Huffman tables; some programs cannot show them");
         note(self.invalid_pairs, "survey pairs are marked invalid and are not used for training");
         if !self.unknown_schemas.is_empty() {

@@ -7,7 +7,7 @@ use anyhow::Context;
 pub use super::live::DriveReport;
 use super::live::{self, DeviceRun, Devices, DriveSettings};
 use crate::{
-    config::{Camera, Gnss, RecordConfig},
+    config::{Camera, Gnss, RecordConfig, Replay},
     devices::{
         CameraEvent, CameraFacts, GpioEvent, SerialEvent, Stop, camera_v4l2, gnss_serial,
         gpio::{self, Led, SimulatedPins},
@@ -272,7 +272,13 @@ pub fn replay_head(recording: &Recording, config: &RecordConfig) -> anyhow::Resu
     let offset_ns = log_offset_ns(recording);
     let boot_id = recording.metadata.get(topics::metadata::SOURCE).and_then(|source| source.get("boot_id"));
     let start = ClockReading { monotonic_ns: 0, realtime_ns: offset_ns as i64 };
-    let mut head = Head::new(&config.resolved(), &recording.name, boot_id.map_or("", String::as_str), start);
+    // Where files lie on this computer says nothing about the drive.
+    let mut settings = config.clone();
+    settings.recorder.folder = ".".into();
+    let replay = Replay { recording: recording.path.file_name().unwrap_or_default().into() };
+    settings.camera = Camera::Replay(replay.clone());
+    settings.gnss = Gnss::Replay(replay);
+    let mut head = Head::new(&settings.resolved(), &recording.name, boot_id.map_or("", String::as_str), start);
     head.calibration_json = recording.calibration_json().map(<[u8]>::to_vec);
     Ok(head)
 }
