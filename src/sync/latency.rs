@@ -115,11 +115,14 @@ struct VisualLag {
 }
 
 const PIECE_NS: u64 = PIECE_S as u64 * NS_PER_S;
+/// Over a longer time the yaw is not known well enough in between.
+const MAX_STEP_NS: u64 = NS_PER_S / 2;
 const MAX_LAG_NS: u64 = (MAX_LAG_S * 1e9) as u64;
 
 impl VisualLag {
     fn push(&mut self, from_ns: u64, to_ns: u64, rotation_rad: f64) {
-        if to_ns <= from_ns || !rotation_rad.is_finite() {
+        if to_ns <= from_ns || to_ns - from_ns > MAX_STEP_NS || !rotation_rad.is_finite() {
+            self.camera.clear();
             return;
         }
         let continued = self.camera.back().filter(|&&(last_ns, _)| last_ns == from_ns);
@@ -156,7 +159,7 @@ impl VisualLag {
         let piece = self.camera.iter().take_while(|point| point.0 <= end_ns);
         let camera: Vec<YawPoint> = piece.map(|&(ns, yaw_rad)| (boot_s + since_s(ns as i64), yaw_rad)).collect();
         // The last point of a piece is the first of the next.
-        self.camera.drain(..camera.len().saturating_sub(1));
+        self.camera.drain(..camera.len().saturating_sub(1).max(1));
         if let Some(piece) = Piece::compare(&camera, &yaw) {
             self.lag.push(piece);
             self.estimate = self.lag.estimate();

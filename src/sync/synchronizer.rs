@@ -257,7 +257,7 @@ impl Synchronizer {
     }
 
     fn accept_fix(&mut self, fix: &Fix) -> Option<PlacedFix> {
-        let std_m = horizontal_std_m(fix);
+        let std_m = horizontal_std_m(fix).filter(|std_m| std_m.is_finite());
         let carried_on = fix.quality == FixQuality::DeadReckoning && fix.position_std_m.is_none();
         if fix.quality == FixQuality::Simulated || carried_on || !fix.position.is_plausible() {
             self.statistics.refused_fixes += 1;
@@ -287,6 +287,9 @@ impl Synchronizer {
 
     /// Yaws of two sources are not mixed: true north goes before magnetic, then whoever was first.
     fn accept_heading(&mut self, heading: &Heading) -> Option<YawSample> {
+        if !heading.yaw_rad.is_finite() {
+            return None;
+        }
         let silent_ns = |known: &YawSource| heading.arrival_ns.saturating_sub(known.last_arrival_ns);
         let better = |known: &YawSource| known.north == North::Magnetic && heading.north == North::True;
         let own = |known: &YawSource| known.name == heading.source && known.north == heading.north;

@@ -1,5 +1,6 @@
 //! What goes wrong, and what pairs say of it.
 
+use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -8,7 +9,7 @@ use super::{
     accuracy::time_errors,
     drive::{Drive, Event, Observers, START_UTC_NS, play, synchronizer},
 };
-use crate::types::{GnssSample, NS_PER_S, SampleTime, TimeScale};
+use crate::types::{GnssSample, NS_PER_S, North, SampleTime, TimeScale, wrap_angle_rad};
 
 fn sample_time(sample: &mut GnssSample) -> &mut Option<SampleTime> {
     match sample {
@@ -301,6 +302,106 @@ fn ten_hours_need_no_more_memory_than_a_minute() {
     assert!(errors_late < 0.01, "{} ms", errors_late * 1e3);
     assert_eq!(synchronizer.statistics().clock_steps, 0);
     assert!(synchronizer.statistics().turns >= 4);
+}
+
+#[test]
+fn what_is_recorded_of_a_sample_is_stamped_with_when_it_was_taken() {
+    let mut drive = Drive::new(Observers { pulse: true, ..Observers::default() }, 20);
+    let events = drive.events(0.0, 30.0);
+    let mut synchronizer = synchronizer(&Settings::default());
+    play(&mut synchronizer, &events);
+    let scale = TimeScale::Utc;
+    let time = Some(SampleTime { ns: drive.receiver_ns(29.0, scale), scale });
+    let truth_ns = Drive::monotonic_ns(29.0);
+    let error_ns = |stamp_ns: u64| stamp_ns.abs_diff(truth_ns);
+    // Whenever it came; without a time of its own, and with one that cannot be, its arrival is what there is.
+    assert!(error_ns(synchronizer.stamp_ns(truth_ns + 300_000_000, time)) < 1_000_000);
+    assert!(error_ns(synchronizer.stamp_ns(truth_ns + 700_000_000, time)) < 1_000_000);
+    assert!(error_ns(synchronizer.stamp_ns(truth_ns + 350_000_000, None)) < 50_000_000);
+    let wrong = Some(SampleTime { ns: 5, scale });
+    assert!(error_ns(synchronizer.stamp_ns(truth_ns + 300_000_000, wrong)) < 50_000_000);
+}
+
+#[test]
+fn the_yaw_comes_from_one_source_and_true_north_goes_first() {
+    let settings = Settings { magnetic_declination_deg: -13.0, ..known_latency() };
+    let mut drive = Drive::new(Observers::default(), 21);
+    let mut events = drive.events(0.0, 20.0);
+    let other_from_ns = Drive::monotonic_ns(8.0);
+    let mut both = Vec::new();
+    for (ns, event) in &mut events {
+        if matches!(event, Event::Sample(GnssSample::Heading(_))) && *ns > other_from_ns {
+            both.push((*ns, event.clone()));
+        }
+        let Event::Sample(GnssSample::Heading(heading)) = event else { continue };
+        // 13 degrees west: the needle points west of north, and yaws counted from it are too small.
+        heading.yaw_rad = wrap_angle_rad(heading.yaw_rad - 13f64.to_radians());
+        (heading.north, heading.source) = (North::Magnetic, "HDM");
+    }
+    events.extend(both);
+    events.sort_by_key(|event| event.0);
+    let pairs = play(&mut synchronizer(&settings), &events);
+    for pair in in_span(&pairs, 3.0..17.0) {
+        let error_rad = wrap_angle_rad(pair.yaw_rad.expect("a yaw") - drive.truth_at(pair.stamp_ns).yaw_rad);
+        assert!(error_rad.abs() < 0.05, "{error_rad} at frame {}", pair.sequence);
+    }
+}
+
+proptest! {
+    #[test]
+    fn nothing_that_is_said_can_break_it(said in prop::collection::vec(any_sample(), 1..150)) {
+        let mut synchronizer = Synchronizer::new(&Settings::default(), None).expect("sound settings");
+        let mut pairs = Vec::new();
+        for (sequence, (sample, stamp_ns)) in said.iter().enumerate() {
+            synchronizer.push_sample(sample);
+            synchronizer.push_frame(sequence as u64, *stamp_ns, None);
+            synchronizer.push_pps(*stamp_ns);
+            synchronizer.push_visual_rotation(stamp_ns / 2, *stamp_ns, f64::from(sequence as u32));
+            synchronizer.poll(*stamp_ns, &mut pairs);
+            synchronizer.utc_at(*stamp_ns);
+            if let GnssSample::Fix(fix) = sample {
+                synchronizer.stamp_ns(fix.arrival_ns, fix.sample_time);
+            }
+        }
+        synchronizer.finish(&mut pairs);
+        let sequences: Vec<u64> = pairs.iter().map(|pair| pair.sequence).collect();
+        prop_assert_eq!(sequences, (0..said.len() as u64).collect::<Vec<u64>>());
+        let sound = |pair: &Pair| pair.position_m.is_some_and(|position_m| position_m.iter().all(|x| x.is_finite()));
+        prop_assert!(pairs.iter().all(|pair| pair.invalid.is_some() || sound(pair)));
+    }
+}
+
+fn a_sample(is_fix: bool) -> GnssSample {
+    let events = Drive::new(Observers::default(), 0).events(0.0, 0.01);
+    let samples = events.into_iter().filter_map(|(_, event)| match event {
+        Event::Sample(sample) if matches!(sample, GnssSample::Fix(_)) == is_fix => Some(sample),
+        _ => None,
+    });
+    samples.last().expect("a fix and a heading at the start")
+}
+
+/// A fix or heading with any times and numbers, and some instant.
+fn any_sample() -> impl Strategy<Value = (GnssSample, u64)> {
+    let time_ns = prop_oneof![any::<i64>(), 0..5_000_000_000i64];
+    let arrival_ns = prop_oneof![any::<u64>(), 0..5_000_000_000u64];
+    let number = prop_oneof![any::<f64>(), -90.0..90.0f64];
+    let samples: Vec<GnssSample> = [true, false].map(a_sample).into();
+    (time_ns, arrival_ns.clone(), arrival_ns, number.clone(), number, 0..4u8).prop_map(
+        move |(ns, arrival_ns, stamp_ns, a, b, what)| {
+            let scale = [TimeScale::Utc, TimeScale::UtcOfDay, TimeScale::Device, TimeScale::Utc][what as usize];
+            let mut sample = samples[usize::from(what == 0)].clone();
+            *sample_time(&mut sample) = (what != 3).then_some(SampleTime { ns, scale });
+            match &mut sample {
+                GnssSample::Fix(fix) => {
+                    (fix.arrival_ns, fix.position.latitude_deg, fix.speed_mps) = (arrival_ns, a, Some(b));
+                    fix.position_std_m = Some([b, a, 1.0]);
+                }
+                GnssSample::Heading(heading) => (heading.arrival_ns, heading.yaw_rad) = (arrival_ns, a),
+                _ => {}
+            }
+            (sample, stamp_ns)
+        },
+    )
 }
 
 #[test]
