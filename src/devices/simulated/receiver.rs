@@ -13,6 +13,8 @@ use crate::{
 /// A receiver at the wrong rate, and the port.
 const SENT_BAUD: u32 = 38_400;
 const READ_BAUD: u32 = 115_200;
+/// How often the sensor passes on what its satellite receiver says, deviations among it.
+const SATELLITES_RATE_HZ: f64 = 4.0;
 /// What a receiver under open sky states.
 const SATELLITES: u8 = 11;
 const HORIZONTAL_DILUTION: f64 = 0.9;
@@ -58,7 +60,11 @@ impl SimulatedReceiver {
     fn write(&mut self, measured: &Measurement, on_for_ns: i64, bytes: &mut Vec<u8>) {
         match self.simulation.settings.receiver.protocol {
             ReceiverProtocol::Nmea => encode::write_arduino_tick(self.tick, measured, bytes),
-            ReceiverProtocol::Xbus => self.sensor.write(measured, on_for_ns, false, bytes),
+            ReceiverProtocol::Xbus => {
+                let rate_hz = self.simulation.settings.receiver.rate_hz;
+                let with_receiver = self.tick.is_multiple_of((rate_hz / SATELLITES_RATE_HZ).round().max(1.0) as u64);
+                self.sensor.write(measured, on_for_ns, with_receiver, bytes);
+            }
         }
     }
 }
