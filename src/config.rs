@@ -106,7 +106,8 @@ impl RecordConfig {
         Ok(config)
     }
 
-    fn parse(text: &str) -> Result<Self, Fault> {
+    /// Reads and checks the text of a file; paths stay as they are.
+    pub fn parse(text: &str) -> Result<Self, Fault> {
         let mut tables = Tables { root: DeTable::parse(text).map_err(Fault::from)?.into_inner() };
         let mut gnss = tables.required("gnss")?;
         let config = Self {
@@ -202,10 +203,11 @@ fn read_gnss(mut table: Table<'_>) -> Result<Gnss, Fault> {
 struct Nothing {}
 
 /// What is wrong, and where in the text.
-#[derive(Debug)]
-struct Fault {
-    offset: usize,
-    what: String,
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Fault {
+    /// Byte of the text.
+    pub offset: usize,
+    pub what: String,
 }
 
 impl Fault {

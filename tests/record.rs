@@ -150,13 +150,7 @@ const FAULTS: [Expected; 9] = [
         frames_meanwhile: false,
     },
     Expected { kind: "camera-stalled", camera: "silent", gnss: "ok", pairs_meanwhile: None, frames_meanwhile: false },
-    Expected {
-        kind: "frames-damaged",
-        camera: "ok",
-        gnss: "ok",
-        pairs_meanwhile: Some(false),
-        frames_meanwhile: true,
-    },
+    Expected { kind: "frames-damaged", camera: "ok", gnss: "ok", pairs_meanwhile: Some(false), frames_meanwhile: true },
     Expected {
         kind: "receiver-unplugged",
         camera: "ok",
@@ -246,8 +240,7 @@ fn rms(values: &[f64]) -> f64 {
 /// The serial line is 300 ms late, with jitter; the pulse shows by how much. On a busy computer the jitter is larger.
 #[test]
 fn pairs_are_right_to_20_ms_behind_a_line_that_is_300_ms_late() {
-    let receiver =
-        "[simulation.receiver]\nrate_hz = 100.0\nlatency_s = 0.3\njitter_s = 0.04\nposition_std_m = 0.0";
+    let receiver = "[simulation.receiver]\nrate_hz = 100.0\nlatency_s = 0.3\njitter_s = 0.04\nposition_std_m = 0.0";
     let settings = format!("duration_s = 30.0\nplace_seed = 3\n{receiver}");
     let folder = tempfile::tempdir().expect("a temporary folder");
     let config = configure(folder.path(), &settings, &[]);

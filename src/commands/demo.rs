@@ -34,8 +34,7 @@ struct Drive {
 
 const SURVEY: Drive = Drive { name: "monday", day_seed: 1, drive_seed: 1, lane_shift_m: 0.0, frame_rate_hz: 4.0 };
 /// Other light and traffic, driven 0.4 m further right, with fewer frames.
-const ANOTHER_DAY: Drive =
-    Drive { name: "tuesday", day_seed: 2, drive_seed: 2, lane_shift_m: 0.4, frame_rate_hz: 1.0 };
+const ANOTHER_DAY: Drive = Drive { name: "tuesday", day_seed: 2, drive_seed: 2, lane_shift_m: 0.4, frame_rate_hz: 1.0 };
 /// Times as fast as real time: a drive of three minutes takes half a minute.
 const SPEED: f64 = 6.0;
 
@@ -48,7 +47,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let survey = record(args, &SURVEY, "a survey drive: camera and receiver become pairs of frame and position")?;
     step("what is in the recording", &["info", &survey])?;
     step("the recording becomes a map", &["train", &survey, "--out", &map, "--force"])?;
-    let other = record(args, &ANOTHER_DAY, "the same streets on another day: other light, other traffic, another lane")?;
+    let other =
+        record(args, &ANOTHER_DAY, "the same streets on another day: other light, other traffic, another lane")?;
     step(
         "every frame of that day, one by one, against the map: where was it? Errors against the receiver's positions, which \
          themselves err by 0.6 m on each axis",

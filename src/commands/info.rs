@@ -14,7 +14,7 @@ use super::{
     print, printable,
     progress::Progress,
 };
-use crate::recording::{Recording, RecordingError, TopicSummary};
+use crate::recording::{DriveHealth, Recording, RecordingError, TopicSummary};
 use crate::sync::{RecordedLag, latency_from_recording};
 
 /// Show what is in a recording or map
@@ -140,11 +140,49 @@ fn as_json(recording: &Recording, size_bytes: u64, lag: Option<RecordedLag>) -> 
             "latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg, "altitude_m": origin.altitude_m,
         })),
         "calibration": recording.calibration().ok(),
+        "drive": (recording.health.seconds > 0).then(|| drive_json(&recording.health)),
         "camera_against_yaw": lag.map(|lag| json!({
             "late_s": lag.late_s, "std_s": lag.std_s, "turns": lag.turns,
         })),
         "metadata": recording.metadata,
     })
+}
+
+fn drive_json(health: &DriveHealth) -> serde_json::Value {
+    let lost: Vec<_> = health.lost.iter().map(|((topic, reason), count)| json!([topic, reason, count])).collect();
+    json!({
+        "seconds": health.seconds,
+        "lost": lost,
+        "troubles_s": health.troubles,
+        "mean_cpu_cores": health.mean_cpu_cores,
+        "max_cpu_cores": health.max_cpu_cores,
+        "first_minute_resident_bytes": health.first_minute_resident_bytes,
+        "later_resident_bytes": health.later_resident_bytes,
+        "max_queue_bytes": health.max_queue_bytes,
+        "max_disk_stall_s": health.max_disk_stall_s,
+        "max_temperature_celsius": health.max_temperature_celsius,
+    })
+}
+
+/// How the drive was recorded.
+fn drive_lines(health: &DriveHealth, line: &mut impl FnMut(&str, String)) {
+    for ((topic, reason), count) in &health.lost {
+        line("lost", format!("{count} on {topic}: {reason}"));
+    }
+    if health.seconds == 0 {
+        return;
+    }
+    for (trouble, seconds) in &health.troubles {
+        line("trouble", format!("{trouble}, {seconds} s"));
+    }
+    let mb = |bytes: u64| format!("{:.1} MB", bytes as f64 * 1e-6);
+    let later = health.later_resident_bytes.map_or(String::new(), |bytes| format!(", then {}", mb(bytes)));
+    line("processor", format!("{:.2} cores on average, {:.2} at most", health.mean_cpu_cores, health.max_cpu_cores));
+    line("memory", format!("{} in the first minute{later}, without the queue", mb(health.first_minute_resident_bytes)));
+    line(
+        "disk",
+        format!("waited for {:.2} s at most, {} in the queue", health.max_disk_stall_s, mb(health.max_queue_bytes)),
+    );
 }
 
 fn as_text(recording: &Recording, size_bytes: u64, lag: Option<RecordedLag>) -> String {
@@ -176,6 +214,7 @@ fn as_text(recording: &Recording, size_bytes: u64, lag: Option<RecordedLag>) -> 
             None => "unknown: positions are local metres".into(),
         },
     );
+    drive_lines(&recording.health, &mut line);
     line(
         "calibration",
         match recording.calibration() {
@@ -203,7 +242,11 @@ fn as_text(recording: &Recording, size_bytes: u64, lag: Option<RecordedLag>) -> 
         let key_width = entries.keys().map(String::len).max().unwrap_or(0);
         text += &format!("\n{}\n", printable(record));
         for (key, value) in entries {
-            text += &format!("  {:<key_width$}  {}\n", printable(key), printable(value));
+            // A value of several lines, such as settings, stands below its key.
+            let mut lines = value.trim_end().lines();
+            let first = if value.trim_end().contains('\n') { None } else { lines.next() };
+            text += &format!("  {:<key_width$}  {}\n", printable(key), printable(first.unwrap_or_default()));
+            lines.for_each(|line| text += &format!("    {}\n", printable(line)));
         }
     }
     text

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use super::{
-    CameraEvent, CameraFacts, CameraFrame, DeviceError, Lost, Stop, camera_v4l2::capture, mjpeg,
-    pty::TimedBytes, wait_until, yuyv,
+    CameraEvent, CameraFacts, CameraFrame, DeviceError, Lost, Stop, camera_v4l2::capture, mjpeg, pty::TimedBytes,
+    wait_until, yuyv,
 };
 use crate::{
     recording::{DeviceRecord, DeviceRecords, RecordingError, TimedRecord},

@@ -10,6 +10,7 @@ use prost::Message;
 
 use super::{
     error::RecordingError,
+    health::DriveHealth,
     proto::foxglove,
     records::{ChannelFacts, Channels, RecordFile, visit_chunk},
     scan::{Scan, parse_calibration},
@@ -71,6 +72,8 @@ pub struct Recording {
     pub image_size_px: Option<(usize, usize)>,
     /// The attachment `donut.json` as it was written.
     pub(super) calibration_json: Option<Vec<u8>>,
+    /// How it was recorded, if it says so.
+    pub health: DriveHealth,
 }
 
 impl Recording {

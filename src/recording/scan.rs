@@ -10,6 +10,7 @@ use prost::Message;
 
 use super::{
     error::RecordingError,
+    health::DriveHealth,
     proto::omniloc,
     reader::{Recording, SurveyFrame, TopicSummary, decode_image, is_topic},
     records::{ChannelFacts, Channels, parse, visit_chunk},
@@ -31,6 +32,7 @@ pub(super) struct Scan {
     /// Frame numbers in the order of the file.
     images: Vec<u32>,
     pairs: BTreeMap<u32, (SurveyFrame, Option<String>)>,
+    health: DriveHealth,
 }
 
 impl Scan {
@@ -56,7 +58,7 @@ impl Scan {
     }
 
     fn read_record(&mut self, opcode: u8, body: &[u8]) -> Result<(), String> {
-        let Self { channels, topics, image_size_px, images, pairs, .. } = self;
+        let Self { channels, topics, image_size_px, images, pairs, health, .. } = self;
         channels.read_record(opcode, body, |channel, header, data| {
             count(topics, channel, header);
             if is_topic(channel, &topics::CAMERA_IMAGE) {
@@ -71,6 +73,12 @@ impl Scan {
                 let sequence = u32::try_from(pair.frame_sequence)
                     .map_err(|_| format!("survey pair of frame {}, expected below 2^32", pair.frame_sequence))?;
                 pairs.entry(sequence).or_insert_with(|| survey_frame(sequence, header.publish_time, pair));
+            } else if is_topic(channel, &topics::STATUS) {
+                let status = omniloc::Status::decode(data).map_err(|error| format!("{}: {error}", channel.topic))?;
+                health.add_status(&status);
+            } else if is_topic(channel, &topics::DROPPED) {
+                let loss = omniloc::Dropped::decode(data).map_err(|error| format!("{}: {error}", channel.topic))?;
+                health.add_loss(loss);
             }
             Ok(())
         })
@@ -109,6 +117,7 @@ impl Scan {
             topics: self.topics,
             image_size_px: self.image_size_px,
             calibration_json: self.calibration_json,
+            health: self.health,
         }
     }
 }

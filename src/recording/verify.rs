@@ -59,7 +59,11 @@ pub fn verify(path: &Path) -> Result<Verdict, RecordingError> {
 }
 
 /// [`verify`] of a recording of `size` bytes from anywhere; `path` is what it is called in messages.
-pub(super) fn verify_reader(path: &Path, reader: impl Read + Send + 'static, size: u64) -> Result<Verdict, RecordingError> {
+pub(super) fn verify_reader(
+    path: &Path,
+    reader: impl Read + Send + 'static,
+    size: u64,
+) -> Result<Verdict, RecordingError> {
     verify_opened(path, RecordFile::from_reader(path, Box::new(reader), size))
 }
 

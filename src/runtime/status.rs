@@ -144,7 +144,9 @@ impl StatusCounter {
     fn gnss_health(&self, now_ns: u64) -> &'static str {
         match self.gnss.health(now_ns) {
             "ok" if self.searching => "no fix",
-            "silent" | "waiting" if self.last_bytes_ns.is_some_and(|last_ns| last_ns + HEARD_NS >= now_ns) => "unreadable",
+            "silent" | "waiting" if self.last_bytes_ns.is_some_and(|last_ns| last_ns + HEARD_NS >= now_ns) => {
+                "unreadable"
+            }
             health => health,
         }
     }
