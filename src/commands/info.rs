@@ -251,3 +251,15 @@ fn as_text(recording: &Recording, size_bytes: u64, lag: Option<RecordedLag>) -> 
     }
     text
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_lag_of_pairs_is_one_line() {
+        let lag = |late_s| describe_lag(RecordedLag { late_s, std_s: 0.004, turns: 6 });
+        assert_eq!(lag(0.0121), "camera against yaw: pairs are 12 ms late (+- 4 ms, 6 turns)");
+        assert_eq!(lag(-0.3), "camera against yaw: pairs are 300 ms early (+- 4 ms, 6 turns)");
+    }
+}

@@ -144,7 +144,7 @@ impl ClockMap {
         }
         self.candidate = None;
         let step_ns = candidate.offset_ns.saturating_sub(envelope_ns);
-        if step_ns < 0 && step_ns >= -MAX_EXCESS_NS {
+        if (-MAX_EXCESS_NS..0).contains(&step_ns) {
             // As likely a latency that fell as a clock that was set: older samples move along.
             self.jumps += 1;
             self.take_in(candidate.offset_ns, arrival_ns);

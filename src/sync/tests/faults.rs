@@ -373,11 +373,11 @@ proptest! {
 
 fn a_sample(is_fix: bool) -> GnssSample {
     let events = Drive::new(Observers::default(), 0).events(0.0, 0.01);
-    let samples = events.into_iter().filter_map(|(_, event)| match event {
+    let mut samples = events.into_iter().filter_map(|(_, event)| match event {
         Event::Sample(sample) if matches!(sample, GnssSample::Fix(_)) == is_fix => Some(sample),
         _ => None,
     });
-    samples.last().expect("a fix and a heading at the start")
+    samples.next().expect("a fix and a heading at the start")
 }
 
 /// A fix or heading with any times and numbers, and some instant.
