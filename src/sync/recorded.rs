@@ -263,7 +263,7 @@ mod tests {
         let surroundings = surroundings();
         for frame in 0..600 {
             let time_s = f64::from(frame) / 10.0;
-            recording.write_image(frame, ns(time_s), picture(&surroundings, yaw_rad(time_s))).expect("writes");
+            recording.write_image(frame, ns(time_s), &picture(&surroundings, yaw_rad(time_s))).expect("writes");
         }
         fs::write(path, recording.finish().expect("finishes").into_inner()).expect("writes");
     }
