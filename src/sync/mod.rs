@@ -12,11 +12,11 @@
 //!  arrival           ───────▼───────────▼─────────────▼─────────▼─►   offset + smallest latency + jitter
 //! ```
 //!
-//! - [`ClockMap`](clock_map::ClockMap): `arrival − sample time` of all samples lies above the offset of the receiver's
+//! - `ClockMap`: `arrival − sample time` of all samples lies above the offset of the receiver's
 //!   clock by the latency of the line, whose jitter is never negative. The lower envelope over two minutes therefore
 //!   follows the clock, drift and steps included. It gives *zero-latency time*: as if the fastest sample had taken no
 //!   time at all.
-//! - [`Latency`](latency::Latency): what remains is the smallest latency, a constant that one-way data cannot show. It is
+//! - `Latency`: what remains is the smallest latency, a constant that one-way data cannot show. It is
 //!   found from edges of the receiver's pulse, else from turns that camera and receiver both saw, else it is a setting.
 //! - A frame's exposure is carried to zero-latency time, and the samples on both sides of it are interpolated.
 //!

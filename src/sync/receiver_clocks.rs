@@ -80,7 +80,7 @@ impl ReceiverClocks {
         self.map(clock)?.offset_ns().map(|_| self.instant(clock, ns))
     }
 
-    /// By how many whole days [ns] a UTC time differs from what is expected at this arrival; 0 before there is a map.
+    /// By how many whole days \[ns\] a UTC time differs from what is expected at this arrival; 0 before there is a map.
     fn days_from_expected_ns(&self, utc_ns: i64, arrival_ns: u64) -> i64 {
         let Some(offset_ns) = self.utc.offset_ns() else { return 0 };
         let expected_ns = (arrival_ns as i64).saturating_sub(offset_ns);
