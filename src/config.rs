@@ -161,9 +161,15 @@ impl RecordConfig {
         resolve(&mut self.recorder.folder);
     }
 
-    /// The settings with all defaults filled in, as TOML: kept in every recording.
+    /// The settings with all defaults filled in, as TOML that loads again: kept in every recording.
     pub fn resolved(&self) -> String {
-        toml::to_string(self).expect("settings are tables of plain values")
+        let mut tables = toml::Table::try_from(self).expect("settings are tables of plain values");
+        // In a file, how bytes are decoded stands in the table of the receiver.
+        let decoder = tables.remove("decoder");
+        if let (Some(toml::Value::Table(decoder)), Some(toml::Value::Table(gnss))) = (decoder, tables.get_mut("gnss")) {
+            gnss.extend(decoder);
+        }
+        toml::to_string(&tables).expect("settings are tables of plain values")
     }
 }
 
@@ -324,6 +330,8 @@ mod tests {
         for name in SHIPPED {
             let text = fs::read_to_string(shipped(name)).expect("readable");
             let config = RecordConfig::load(&shipped(name)).unwrap_or_else(|error| panic!("{error}"));
+            let again = RecordConfig::parse(&config.resolved()).unwrap_or_else(|fault| panic!("{name}: {fault:?}"));
+            assert_eq!(again, config, "{name}");
             let uncommented: String = text
                 .lines()
                 .map(|line| match line.strip_prefix("# ") {

@@ -242,11 +242,10 @@ fn as_text(recording: &Recording, size_bytes: u64, lag: Option<RecordedLag>) -> 
         let key_width = entries.keys().map(String::len).max().unwrap_or(0);
         text += &format!("\n{}\n", printable(record));
         for (key, value) in entries {
-            // A value of several lines, such as settings, stands below its key.
-            let mut lines = value.trim_end().lines();
-            let first = if value.trim_end().contains('\n') { None } else { lines.next() };
-            text += &format!("  {:<key_width$}  {}\n", printable(key), printable(first.unwrap_or_default()));
-            lines.for_each(|line| text += &format!("    {}\n", printable(line)));
+            // Settings are a whole file.
+            let lines = value.lines().count();
+            let value = if lines > 1 { format!("{lines} lines: see --json") } else { printable(value) };
+            text += &format!("  {:<key_width$}  {value}\n", printable(key));
         }
     }
     text

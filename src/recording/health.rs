@@ -21,7 +21,7 @@ pub struct DriveHealth {
     pub max_queue_bytes: u64,
     pub max_disk_stall_s: f64,
     pub max_temperature_celsius: Option<f64>,
-    /// Seconds in which camera, receiver or disk said something else than `ok`.
+    /// Seconds in which camera, receiver or disk said that something is wrong.
     pub troubles: BTreeMap<String, u64>,
 }
 
@@ -44,7 +44,8 @@ impl DriveHealth {
         let hottest = [self.max_temperature_celsius, status.temperature_celsius].into_iter().flatten();
         self.max_temperature_celsius = hottest.reduce(f64::max);
         let devices = [("camera", &status.camera_health), ("gnss", &status.gnss_health), ("disk", &status.disk_health)];
-        for (device, health) in devices.into_iter().filter(|(_, health)| *health != "ok" && !health.is_empty()) {
+        let is_trouble = |health: &str| !["ok", "waiting", "stopped", ""].contains(&health);
+        for (device, health) in devices.into_iter().filter(|(_, health)| is_trouble(health)) {
             *self.troubles.entry(format!("{device} {health}")).or_default() += 1;
         }
     }
@@ -66,7 +67,8 @@ mod tests {
                 cpu_cores: if second % 2 == 0 { 0.2 } else { 0.4 },
                 resident_bytes: 30_000_000 + second * 1000,
                 queue_bytes: second * 1000,
-                camera_health: if second < 3 { "waiting" } else { "ok" }.into(),
+                camera_health: if second < 3 { "silent" } else { "ok" }.into(),
+                gnss_health: "waiting".into(),
                 ..Status::default()
             });
         }
@@ -74,7 +76,7 @@ mod tests {
         assert_eq!(health.later_resident_bytes, Some(30_000_000));
         assert!((health.mean_cpu_cores - 0.3).abs() < 1e-12);
         assert_eq!((health.max_cpu_cores, health.max_queue_bytes), (0.4, 99_000));
-        assert_eq!(health.troubles, BTreeMap::from([("camera waiting".into(), 3)]));
+        assert_eq!(health.troubles, BTreeMap::from([("camera silent".into(), 3)]));
         for _ in 0..2 {
             health.add_loss(Dropped { topic: "/camera/image".into(), count: 3, ..Dropped::default() });
         }

@@ -28,8 +28,10 @@ use crate::{
 /// Where the clocks of a simulated drive start: a computer that was switched on a while ago.
 const SIMULATED_START: ClockReading =
     ClockReading { monotonic_ns: 100 * NS_PER_S, realtime_ns: 1_790_000_000 * NS_PER_S as i64 };
-/// A simulated drive begins so long after the clocks start: the time that everything needs to be ready [ns of the clock].
-const SIMULATED_LEAD_NS: u64 = NS_PER_S / 2;
+/// A simulated drive begins so long after the clocks start: what everything needs to be ready [s in real time], but at
+/// most what a receiver may be silent for [s of the clock].
+const SIMULATED_LEAD_S: f64 = 0.5;
+const LONGEST_LEAD_S: f64 = 2.0;
 
 /// Records a drive as `config` says, until it is told to stop or its devices end; `each_second` is told the status.
 pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) -> anyhow::Result<DriveReport> {
@@ -59,6 +61,9 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
     let boot_id = boot_id();
     let mut head = Head::new(&config.resolved(), &config.vehicle.name, &boot_id, clock.read());
     head.calibration_json = calibration;
+    let start_s = clock.read().monotonic_ns / NS_PER_S;
+    let name = format!("{}, {} at {start_s} s", config.vehicle.name, boot_id.get(..8).unwrap_or_default());
+    head.name_source(&name);
     let log_offset_ns = head.log_offset_ns;
     let storage = Folder::new(&config.recorder.folder)
         .with_context(|| format!("making the folder {}", config.recorder.folder.display()))?;
@@ -96,7 +101,8 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
 /// The world of a simulated drive, and the truth of what happens in it.
 pub fn simulate(settings: &simulated::Settings) -> (Simulation, World) {
     let world = settings.world();
-    let start_ns = SIMULATED_START.monotonic_ns + (SIMULATED_LEAD_NS as f64 * settings.speed.max(1.0)) as u64;
+    let lead_s = (SIMULATED_LEAD_S * settings.speed).clamp(SIMULATED_LEAD_S, LONGEST_LEAD_S);
+    let start_ns = SIMULATED_START.monotonic_ns + (lead_s * 1e9) as u64;
     (Simulation::new(settings, &world, start_ns, SIMULATED_START.realtime_ns), world)
 }
 
@@ -280,6 +286,7 @@ pub fn replay_head(recording: &Recording, config: &RecordConfig) -> anyhow::Resu
     settings.gnss = Gnss::Replay(replay);
     let mut head = Head::new(&settings.resolved(), &recording.name, boot_id.map_or("", String::as_str), start);
     head.calibration_json = recording.calibration_json().map(<[u8]>::to_vec);
+    head.name_source(&recording.name);
     Ok(head)
 }
 

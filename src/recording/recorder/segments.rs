@@ -115,6 +115,11 @@ impl Head {
         head
     }
 
+    /// What the drive is called where several are listed.
+    pub fn name_source(&mut self, name: &str) {
+        self.metadata.entry(metadata::SOURCE.into()).or_default().insert("name".into(), name.into());
+    }
+
     /// Sets a metadata record.
     pub fn set(&mut self, name: &str, entries: &[(&str, &str)]) {
         let entries = entries.iter().map(|&(key, value)| (key.into(), value.into())).collect();
