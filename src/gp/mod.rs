@@ -6,7 +6,9 @@
 
 pub mod fit;
 mod kernel;
+pub mod likelihood;
 pub mod minimize;
+mod starts;
 
 use faer::linalg::solvers::{Llt, Solve};
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
@@ -78,14 +80,17 @@ impl LearningPositions {
 
     /// The Cholesky factor of R = K + σ_e² I.
     fn factorize(&self, hyperparameters: &Hyperparameters) -> Result<Llt<f64>, GpError> {
-        let mut r = self.kernel_matrix(hyperparameters);
-        let noise_variance = hyperparameters.noise_std.powi(2);
-        for i in 0..self.len() {
-            r[(i, i)] += noise_variance;
-        }
-        r.llt(Side::Lower)
-            .map_err(|_| GpError::NotPositiveDefinite { points: self.len(), hyperparameters: *hyperparameters })
+        factorize_with_noise(self.kernel_matrix(hyperparameters), hyperparameters.noise_std.powi(2))
+            .ok_or(GpError::NotPositiveDefinite { points: self.len(), hyperparameters: *hyperparameters })
     }
+}
+
+/// The Cholesky factor of `k` + `noise_variance` I; `None` when that is not positive definite in floating point.
+fn factorize_with_noise(mut k: Mat<f64>, noise_variance: f64) -> Option<Llt<f64>> {
+    for i in 0..k.nrows() {
+        k[(i, i)] += noise_variance;
+    }
+    k.llt(Side::Lower).ok()
 }
 
 /// Eigendecomposition of a kernel matrix; values in rising order, none negative.

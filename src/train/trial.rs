@@ -267,7 +267,7 @@ impl Queries<'_> {
         let features = self.features(group, &self.trial.split.validation);
         let rows: Vec<Vec<f32>> = features.par_iter().map(|row| field.log_likelihood_of_each(row)).collect();
         for (row, &truth_m) in rows.into_iter().zip(&self.validation_m) {
-            table.push(truth_m, &row);
+            table.push(truth_m, row);
         }
         Ok(backward_elimination(&table, |_| on_step(Step::FeatureEliminated)).best_subset())
     }
