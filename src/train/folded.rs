@@ -162,10 +162,10 @@ mod tests {
     use crate::features::Descriptor;
     use crate::map::{Recipe, RecipeName};
 
-    /// 80 positions on a loop; property 0..8 follow the place, the other 64 are noise.
+    /// 160 positions on a loop; property 0..8 follow the place, the other 64 are noise.
     #[test]
     fn features_that_are_noise_are_left_out() {
-        let n = 80;
+        let n = 160;
         let turn = |i: usize| std::f64::consts::TAU * i as f64 / n as f64;
         let positions: Vec<PositionM> = (0..n).map(|i| [20.0 * turn(i).cos(), 20.0 * turn(i).sin()]).collect();
         let learning = LearningPositions::new(positions);
