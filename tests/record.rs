@@ -360,6 +360,19 @@ fn a_replay_makes_the_same_bytes_every_time_and_through_the_drivers_the_same_pai
 }
 
 #[test]
+fn a_drive_reads_with_the_public_python_packages() {
+    let Some(python) = common::python() else { return };
+    let drive = Drive::record("duration_s = 6.0\n[simulation.receiver]\nprotocol = \"xbus\"", &[]);
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/read_drive.py");
+    let output = Command::new(&python).arg(script).arg(&drive.path).output();
+    let output = output.unwrap_or_else(|error| panic!("OMNILOC_PYTHON={python} does not start: {error}"));
+    assert!(output.status.success(), "{}", stderr(&output));
+    let (valid, frames) = drive.valid_between(0.0, 6.0);
+    assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), format!("{frames} frames, {valid} usable"));
+    assert!(valid > 10, "{valid} of {frames}: MTData2 packets are understood");
+}
+
+#[test]
 fn a_wrong_configuration_is_the_callers_mistake() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let config = configure(folder.path(), "duration_s = 600.0", &[("meteor", 1.0, 1.0)]);

@@ -350,10 +350,7 @@ fn a_reader_that_stops_early_is_no_error() {
 /// The recording as other people's programs see it. `tests/run` makes the Python environment and names it.
 #[test]
 fn python_reads_what_was_recorded() {
-    let Ok(python) = std::env::var("OMNILOC_PYTHON") else {
-        println!("not run: OMNILOC_PYTHON is unset; tests/run sets up the Python packages and runs this test");
-        return;
-    };
+    let Some(python) = common::python() else { return };
     let dataset = TinyDataset::new();
     let recording = dataset.path("a.mcap");
     omniloc()

@@ -271,10 +271,7 @@ fn a_bad_split_or_truth_names_its_line() {
 /// Set by `tests/run`: a Python with the packages of `tests/python/requirements.txt`.
 #[test]
 fn python_reads_the_map_without_our_code() {
-    let Ok(python) = std::env::var("OMNILOC_PYTHON") else {
-        eprintln!("tests/run sets OMNILOC_PYTHON and runs this");
-        return;
-    };
+    let Some(python) = common::python() else { return };
     let folder = folder();
     let recording = recording(&folder, 16);
     let map = folder.path().join("area.map");

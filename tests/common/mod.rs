@@ -80,6 +80,15 @@ pub fn omniloc() -> Command {
     Command::new(env!("CARGO_BIN_EXE_omniloc"))
 }
 
+/// The Python that has `tests/python/requirements.txt`; `tests/run` makes it and runs what needs it.
+pub fn python() -> Option<String> {
+    let python = std::env::var("OMNILOC_PYTHON").ok();
+    if python.is_none() {
+        println!("not run: OMNILOC_PYTHON is unset; tests/run sets up the Python packages and runs this test");
+    }
+    python
+}
+
 /// Exit code, stdout, stderr of a command.
 pub fn run(command: &mut Command) -> (i32, String, String) {
     let output = command.output().expect("the program starts");
