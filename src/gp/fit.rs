@@ -1,6 +1,6 @@
 //! Hyperparameters by maximum likelihood.
 
-use faer::{Mat, MatRef};
+use faer::MatRef;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -242,6 +242,8 @@ fn standard_deviation(z: &[f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use faer::Mat;
+
     use super::super::tests::golden_gp;
     use super::*;
     use crate::golden::{golden, list};
