@@ -1,5 +1,8 @@
 //! The bits of a scan.
 
+/// Bits there are at least after a refill.
+pub const REFILLED_BITS: u32 = 56;
+
 /// Reads bits, highest first.
 #[derive(Debug, Clone, Copy)]
 pub struct Bits<'a> {
@@ -17,13 +20,13 @@ impl<'a> Bits<'a> {
         Self { bytes, buffer: 0, count: 0, next: start }
     }
 
-    /// Makes at least 56 bits available.
+    /// Makes at least [`REFILLED_BITS`] available.
     #[inline(always)]
     pub fn refill(&mut self) {
         let word = self.bytes.get(self.next..self.next + 8).map_or([0; 8], |bytes| bytes.try_into().expect("8 bytes"));
         self.buffer |= u64::from_be_bytes(word) >> self.count;
         self.next += (63 - self.count as usize) / 8;
-        self.count |= 56;
+        self.count |= REFILLED_BITS;
     }
 
     /// The next bits, in the highest places.
@@ -32,7 +35,7 @@ impl<'a> Bits<'a> {
         self.buffer
     }
 
-    /// The next `count` bits, of 1..=56.
+    /// The next `count` bits, of 1..=[`REFILLED_BITS`].
     #[inline(always)]
     pub fn peek(&self, count: u32) -> usize {
         (self.buffer >> (64 - count)) as usize

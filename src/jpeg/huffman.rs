@@ -5,10 +5,13 @@
 use super::bits::Bits;
 
 /// Bits a table is looked up with. More resolve more at a time, but the tables should stay in the fastest cache.
-pub const WINDOW: u32 = 10;
+pub const WINDOW: u32 = 11;
 const ENTRIES: usize = 1 << WINDOW;
 /// No code is longer.
 const MAX_CODE_BITS: u32 = 16;
+
+/// A code with the value that follows it.
+pub const MAX_SYMBOL_BITS: u32 = MAX_CODE_BITS + 15;
 
 /// The bits that come next are not a code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -123,19 +126,17 @@ impl DcTable {
     #[inline(always)]
     pub fn difference(&self, bits: &mut Bits) -> Result<i32, NoCode> {
         let entry = self.entries[bits.peek(WINDOW)];
-        if entry != 0 {
-            bits.consume(entry as u32 & 0xFF);
-            return Ok(entry >> 8);
-        }
-        self.long_difference(bits)
+        let (difference, length) =
+            if entry != 0 { (entry >> 8, entry as u32 & 0xFF) } else { self.long(bits.buffer())? };
+        bits.consume(length);
+        Ok(difference)
     }
 
+    /// The difference the 64 `bits` begin with, and its length.
     #[cold]
-    fn long_difference(&self, bits: &mut Bits) -> Result<i32, NoCode> {
-        let symbol = self.canonical.symbol(bits.buffer()).ok_or(NoCode)?;
-        let difference = extended(bits.buffer() << symbol.code_bits, symbol.value_bits());
-        bits.consume(symbol.bits());
-        Ok(difference)
+    fn long(&self, bits: u64) -> Result<(i32, u32), NoCode> {
+        let symbol = self.canonical.symbol(bits).ok_or(NoCode)?;
+        Ok((extended(bits << symbol.code_bits, symbol.value_bits()), symbol.bits()))
     }
 }
 
@@ -163,10 +164,12 @@ pub struct Pair {
 }
 
 impl Pair {
+    #[inline(always)]
     pub fn bits(self) -> u32 {
         u32::from(self.bits_and_end & 0x7F)
     }
 
+    #[inline(always)]
     pub fn ends(self) -> bool {
         self.bits_and_end & 0x80 != 0
     }
@@ -181,10 +184,12 @@ pub struct Skip {
 }
 
 impl Skip {
+    #[inline(always)]
     pub fn bits(self) -> u32 {
         u32::from(self.bits_and_end & 0x7F)
     }
 
+    #[inline(always)]
     pub fn ends(self) -> bool {
         self.bits_and_end & 0x80 != 0
     }
@@ -192,6 +197,7 @@ impl Skip {
 
 /// One coefficient, or the end of the block, or 16 zeros.
 pub struct Coefficient {
+    pub bits: u32,
     pub value: i32,
     /// Zeros before it.
     pub run: usize,
@@ -205,7 +211,7 @@ impl AcTable {
         for window in 0..ENTRIES {
             let bits = (window as u64) << (64 - WINDOW);
             pairs[window] = pair(&canonical, bits);
-            skips[window] = skip(&canonical, bits, 0, 0);
+            skips[window] = skip(&canonical, bits, 0);
         }
         Some(Self { canonical, pairs, skips })
     }
@@ -221,37 +227,39 @@ impl AcTable {
         self.skips[bits.peek(WINDOW)]
     }
 
-    /// Reads one symbol. Needs 31 bits.
-    pub fn coefficient(&self, bits: &mut Bits) -> Result<Coefficient, NoCode> {
-        let symbol = self.canonical.symbol(bits.buffer()).ok_or(NoCode)?;
-        let value = extended(bits.buffer() << symbol.code_bits, symbol.value_bits());
-        bits.consume(symbol.bits());
+    /// What the 64 `bits` begin with.
+    #[cold]
+    pub fn coefficient(&self, bits: u64) -> Result<Coefficient, NoCode> {
+        let symbol = self.canonical.symbol(bits).ok_or(NoCode)?;
+        let value = extended(bits << symbol.code_bits, symbol.value_bits());
         let run = usize::from(symbol.value >> 4);
-        Ok(Coefficient { value, run, ends: symbol.value_bits() == 0 && run != 15 })
+        Ok(Coefficient { bits: symbol.bits(), value, run, ends: symbol.value_bits() == 0 && run != 15 })
     }
 }
 
-/// A whole block passed over, DC difference and all.
+/// Whole blocks passed over, but for the DC difference.
 #[derive(Debug)]
-pub struct SkipTable {
-    skips: Box<[Skip; ENTRIES]>,
+pub struct BlockTable {
+    entries: Box<[(i16, Skip); ENTRIES]>,
 }
 
-impl SkipTable {
+impl BlockTable {
     pub fn new(dc: &DcTable, ac: &AcTable) -> Self {
-        let mut skips = Box::new([Skip::default(); ENTRIES]);
-        for (window, entry) in skips.iter_mut().enumerate() {
+        let mut entries = Box::new([Default::default(); ENTRIES]);
+        for (window, entry) in entries.iter_mut().enumerate() {
             let bits = (window as u64) << (64 - WINDOW);
             if let Some(symbol) = dc.canonical.symbol(bits).filter(|symbol| symbol.bits() <= WINDOW) {
-                *entry = skip(&ac.canonical, bits, symbol.bits(), 0);
+                let difference = extended(bits << symbol.code_bits, symbol.value_bits()) as i16;
+                *entry = (difference, skip(&ac.canonical, bits, symbol.bits()));
             }
         }
-        Self { skips }
+        Self { entries }
     }
 
+    /// The difference, and as many coefficients as fit.
     #[inline(always)]
-    pub fn skip(&self, bits: &Bits) -> Skip {
-        self.skips[bits.peek(WINDOW)]
+    pub fn skip(&self, bits: &Bits) -> (i16, Skip) {
+        self.entries[bits.peek(WINDOW)]
     }
 }
 
@@ -285,7 +293,8 @@ fn pair(canonical: &Canonical, bits: u64) -> Pair {
 }
 
 /// Passes over symbols from the `used` first bits on.
-fn skip(canonical: &Canonical, bits: u64, mut used: u32, mut advance: u8) -> Skip {
+fn skip(canonical: &Canonical, bits: u64, mut used: u32) -> Skip {
+    let mut advance = 0;
     while let Some(symbol) = canonical.symbol(bits << used).filter(|symbol| used + symbol.bits() <= WINDOW) {
         let run = symbol.value >> 4;
         if symbol.value_bits() == 0 && run != 15 {

@@ -1,7 +1,12 @@
 //! JPEG frames: is it a whole image, how large is it, what a webcam leaves out, and its luma.
 
+mod baseline;
+mod bits;
 mod decode;
+mod huffman;
+mod idct;
 mod markers;
+mod unstuff;
 
 pub use decode::{JpegError, LumaDecoder, MAX_SIDE_PX};
 pub use markers::{JpegInfo, MarkerError, scan, scan_header, standard_huffman_segment, with_huffman_tables};

@@ -12,6 +12,6 @@ pub use calibration::{AzimuthSense, CalibrationError, DonutCalibration, LensKind
 pub use geodesy::{Geodetic, LocalFrame};
 pub use geometry::{PositionM, distance_m, wrap_angle_rad};
 pub use gnss::{Fix, FixQuality, GnssSample, Heading, North, SampleTime, TimeScale};
-pub use image::LumaImage;
+pub use image::{LumaImage, Tiles};
 pub use pool::{BufferPool, PooledBytes};
 pub use time::{Clock, ClockReading, ManualClock, NS_PER_S, ScaledClock, SystemClock};
