@@ -71,7 +71,8 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
 
     let ports = tempfile::tempdir().context("making a folder for pseudo-terminals")?;
     let stop = Stop::default();
-    let (gnss, player) = gnss(config, simulation.as_ref(), ports.path(), &clock, &stop)?;
+    let line = gnss(config, simulation.as_ref(), ports.path(), &clock, &stop)?;
+    let (gnss, player) = line.map_or((None, None), |line| (Some(line.driver), line.player));
     let led = Led::default();
     let devices = Devices {
         camera: match camera.take() {
@@ -129,21 +130,29 @@ fn real_or_replayed_camera(config: &RecordConfig) -> anyhow::Result<Option<Devic
     })
 }
 
-/// The serial line, and the thread that plays a simulated or replayed receiver into it.
+/// A serial line, and the thread that plays a simulated or replayed receiver into it.
+struct Line {
+    driver: DeviceRun<SerialEvent>,
+    player: Option<JoinHandle<()>>,
+}
+
+/// The receiver's line, if there is one.
 fn gnss(
     config: &RecordConfig,
     simulation: Option<&(Simulation, &World)>,
     ports: &Path,
     clock: &Arc<dyn Clock>,
     stop: &Stop,
-) -> anyhow::Result<(Option<DeviceRun<SerialEvent>>, Option<JoinHandle<()>>)> {
+) -> anyhow::Result<Option<Line>> {
     let link = ports.join("receiver");
     let play = |bytes, unplugged_ns| play(bytes, unplugged_ns, &link, clock, stop);
     let player = match (&config.gnss, simulation) {
-        (Gnss::None, _) => return Ok((None, None)),
+        (Gnss::None, _) => return Ok(None),
         (Gnss::Serial(settings), _) => {
             let settings = settings.clone();
-            return Ok((Some(Box::new(move |clock, stop, emit| gnss_serial::run(&settings, clock, stop, emit))), None));
+            let driver: DeviceRun<SerialEvent> =
+                Box::new(move |clock, stop, emit| gnss_serial::run(&settings, clock, stop, emit));
+            return Ok(Some(Line { driver, player: None }));
         }
         (Gnss::Replay(replay), _) => play(Box::new(replay::serial_bytes(&replay.recording)?), Vec::new())?,
         (Gnss::Simulated, Some((simulation, world))) => {
@@ -158,12 +167,12 @@ fn gnss(
         silence_timeout_s: SIMULATED_SILENCE_S,
     };
     let ended = player.ended.clone();
-    let run: DeviceRun<SerialEvent> = Box::new(move |clock, stop, emit| {
+    let driver: DeviceRun<SerialEvent> = Box::new(move |clock, stop, emit| {
         let outcome = gnss_serial::run(&settings, clock, stop, emit);
         // At the end of the drive the line is taken away, and that is not a fault.
         if ended.is_stopped() { Ok(()) } else { outcome }
     });
-    Ok((Some(run), Some(player.thread)))
+    Ok(Some(Line { driver, player: Some(player.thread) }))
 }
 
 /// Speed that a pseudo-terminal pretends to have.
