@@ -5,7 +5,12 @@
 use std::{
     fmt,
     io::{self, IsTerminal, Write},
-    sync::{Mutex, MutexGuard, PoisonError},
+    sync::{
+        OnceLock,
+        mpsc::{self, Receiver, SyncSender},
+    },
+    thread,
+    time::Duration,
 };
 
 use tracing::{Event, Level, Subscriber};
@@ -15,10 +20,53 @@ use tracing_subscriber::{
     registry::LookupSpan,
 };
 
-/// What stands in the last line of the terminal.
-static STATUS_LINE: Mutex<String> = Mutex::new(String::new());
+/// Lines on their way to stderr. When nobody reads them, as behind a stalled connection, lines are left out: a recording
+/// never waits for its diagnostics, nor does it end because nobody wants them.
+const QUEUED_LINES: usize = 256;
+/// At the end, what is queued has this long to be written.
+const LAST_LINES: Duration = Duration::from_millis(300);
 /// Carriage return, and clear to the end of the line.
 const CLEAR_LINE: &str = "\r\x1b[K";
+
+static STDERR: OnceLock<SyncSender<Line>> = OnceLock::new();
+
+enum Line {
+    Text(Vec<u8>),
+    /// What stands in the last line of the terminal from now on.
+    Status(String),
+    Flush(SyncSender<()>),
+}
+
+/// Sends a line to the thread that writes; there is one from the first line on.
+fn send(line: Line) {
+    let sender = STDERR.get_or_init(|| {
+        let (sender, lines) = mpsc::sync_channel(QUEUED_LINES);
+        // Without the thread nothing is written, and nothing else happens.
+        let _ = thread::Builder::new().name("journal".into()).spawn(move || write_lines(&lines));
+        sender
+    });
+    let _ = sender.try_send(line);
+}
+
+/// Whatever happens to stderr is ignored: there is nobody left to tell.
+fn write_lines(lines: &Receiver<Line>) {
+    let mut status = String::new();
+    for line in lines {
+        let mut stderr = io::stderr().lock();
+        let _ = match line {
+            Line::Text(text) if status.is_empty() => stderr.write_all(&text),
+            Line::Text(text) => stderr.write_all(&[CLEAR_LINE.as_bytes(), text.as_slice(), status.as_bytes()].concat()),
+            Line::Status(text) => {
+                status = text;
+                write!(stderr, "{CLEAR_LINE}{status}")
+            }
+            Line::Flush(done) => {
+                let _ = done.try_send(());
+                stderr.flush()
+            }
+        };
+    }
+}
 
 /// Starts diagnostics: `info` and above, or what `RUST_LOG` asks for.
 pub fn start() {
@@ -35,22 +83,19 @@ pub fn start() {
 /// Replaces the status line. Elsewhere than on a terminal there is none.
 pub fn show_status(text: &str) {
     if io::stderr().is_terminal() {
-        let mut line = lock();
-        *line = text.to_owned();
-        let _ = write!(io::stderr().lock(), "{CLEAR_LINE}{line}");
+        send(Line::Status(text.to_owned()));
     }
 }
 
-/// Takes the status line away.
-pub fn clear_status() {
+/// Takes the status line away and waits a moment for what is queued.
+pub fn finish() {
     show_status("");
+    let (done, written) = mpsc::sync_channel(1);
+    send(Line::Flush(done));
+    let _ = written.recv_timeout(LAST_LINES);
 }
 
-fn lock() -> MutexGuard<'static, String> {
-    STATUS_LINE.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// Stderr that keeps the status line at the bottom.
+/// Stderr with the status line at the bottom.
 struct Stderr;
 
 impl<'a> MakeWriter<'a> for Stderr {
@@ -64,20 +109,12 @@ impl<'a> MakeWriter<'a> for Stderr {
 impl Write for Stderr {
     /// `text` is whole lines: the subscriber writes one event at a time.
     fn write(&mut self, text: &[u8]) -> io::Result<usize> {
-        let line = lock();
-        let mut stderr = io::stderr().lock();
-        if line.is_empty() {
-            stderr.write_all(text)?;
-        } else {
-            stderr.write_all(CLEAR_LINE.as_bytes())?;
-            stderr.write_all(text)?;
-            stderr.write_all(line.as_bytes())?;
-        }
+        send(Line::Text(text.to_owned()));
         Ok(text.len())
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        io::stderr().flush()
+        Ok(())
     }
 }
 

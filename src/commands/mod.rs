@@ -101,7 +101,9 @@ pub fn print(text: &str) -> io::Result<()> {
     let mut stdout = io::stdout().lock();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        outcome => outcome,
+        outcome => {
+            outcome.map_err(|error| io::Error::new(error.kind(), format!("writing the results to stdout: {error}")))
+        }
     }
 }
 

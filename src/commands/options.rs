@@ -41,6 +41,22 @@ pub enum OutputKind {
     Folder,
 }
 
+/// Something in a folder that a data set or a set of images does not have: such a folder is never replaced.
+fn foreign_entry(folder: &Path) -> Option<String> {
+    const FILES: [&str; 4] = ["positions.csv", "donut.json", "recording.json", "truth.csv"];
+    let is_image = |path: &Path| path.is_file() && path.extension().is_some_and(|extension| extension == "jpg");
+    let is_ours = |path: &Path| {
+        let is_images = || {
+            let Ok(mut entries) = fs::read_dir(path) else { return false };
+            path.ends_with("images") && entries.all(|entry| entry.is_ok_and(|entry| is_image(&entry.path())))
+        };
+        is_image(path) || path.is_file() && FILES.iter().any(|name| path.ends_with(name)) || is_images()
+    };
+    let entries = fs::read_dir(folder).ok()?;
+    let foreign = entries.flatten().map(|entry| entry.path()).find(|path| !is_ours(path))?;
+    Some(foreign.file_name().unwrap_or_default().to_string_lossy().into_owned())
+}
+
 /// Refuses an output that exists, unless `force` is given and it is of the kind that will be written.
 pub fn check_output(out: &Path, kind: OutputKind, force: bool) -> Result<(), BadArgument> {
     let Ok(facts) = fs::symlink_metadata(out) else { return Ok(()) };
@@ -49,7 +65,13 @@ pub fn check_output(out: &Path, kind: OutputKind, force: bool) -> Result<(), Bad
         OutputKind::Folder => facts.is_dir(),
     };
     match (is_kind, force) {
-        (true, true) => Ok(()),
+        (true, true) => match foreign_entry(out) {
+            Some(name) if kind == OutputKind::Folder => Err(BadArgument(format!(
+                "--out {}: holds {name}, which is no output of this command; choose another name",
+                out.display()
+            ))),
+            _ => Ok(()),
+        },
         (true, false) => {
             Err(BadArgument(format!("--out {}: exists already; give --force to replace it", out.display())))
         }

@@ -4,14 +4,14 @@ use std::{path::PathBuf, process::ExitCode};
 
 use super::{BadArgument, DATA_LOST, DONE, journal, print};
 use crate::{
-    config::RecordConfig,
+    config::{Camera, RecordConfig},
     recording::proto::omniloc::Status,
     runtime::drive::{self, DriveReport},
 };
 
 /// Record a survey drive: camera and receiver become synchronized pairs
 ///
-/// Runs until SIGTERM or SIGINT (Ctrl-C), which end it cleanly within 20 s, or until the power is cut, which costs at
+/// Runs until SIGTERM, SIGHUP or SIGINT (Ctrl-C), which end it cleanly within 20 s, or until the power is cut, which costs at
 /// most the last second. What an earlier power cut left behind is mended at the start. SIGUSR1, the button or `omniloc
 /// mark` keep what is being recorded from being deleted when the disk is full.
 #[derive(Debug, clap::Args)]
@@ -28,11 +28,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let config = RecordConfig::load(&args.config).map_err(|error| BadArgument(chain(&error)))?;
     if args.check {
         print(&config.resolved())?;
+    }
+    if matches!(config.camera, Camera::V4l2(_)) && !cfg!(feature = "vehicle") {
+        let what = "this program was built without the camera driver: cargo build --release --features vehicle";
+        return Err(BadArgument(format!("{}: [camera]: driver is \"v4l2\", but {what}", args.config.display())).into());
+    }
+    if args.check {
         return Ok(DONE.into());
     }
     journal::start();
     let outcome = drive::record(&config, |status| journal::show_status(&line(status)));
-    journal::clear_status();
+    journal::finish();
     finish(&outcome?)
 }
 
@@ -74,7 +80,7 @@ pub fn line(status: &Status) -> String {
     )
 }
 
-fn summary(DriveReport { status, recorder, folder }: &DriveReport) -> String {
+fn summary(DriveReport { status, recorder, folder, .. }: &DriveReport) -> String {
     let mut text = format!(
         "recorded       {} frames, {} pairs, {} of them unusable, {:.1} MB in {}\n",
         status.frames,
@@ -85,7 +91,7 @@ fn summary(DriveReport { status, recorder, folder }: &DriveReport) -> String {
     );
     text += &format!("lost           {} frames, {} messages\n", status.frames_dropped, recorder.health.lost);
     if !recorder.is_complete {
-        text += "warning        the disk did not take everything in time; the next start mends the last segment\n";
+        text += "warning        the disk did not take everything, or lost it; the next start mends what it finds\n";
     }
     text
 }

@@ -72,8 +72,11 @@ fn parse_speed(text: &str) -> Result<Speed, String> {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_input(&args.recording)?;
     check_not_input(&args.out, std::slice::from_ref(&args.recording))?;
-    let kind = if args.speed == Speed::Max { OutputKind::File } else { OutputKind::Folder };
-    check_output(&args.out, kind, args.force)?;
+    match args.speed {
+        Speed::Max => check_output(&args.out, OutputKind::File, args.force)?,
+        // Segments of two drives in one folder are mixed up for good.
+        Speed::Times(_) => check_output(&args.out, OutputKind::Folder, false)?,
+    }
     let given = args.config.as_deref().map(RecordConfig::load).transpose();
     let given = given.map_err(|error| BadArgument(error.to_string()))?;
     journal::start();
@@ -84,7 +87,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Speed::Times(times) => {
             let config = RecordConfig { replay_speed: times, ..config };
             let outcome = drive::record(&config, |status| journal::show_status(&record::line(status)));
-            journal::clear_status();
+            journal::finish();
             record::finish(&outcome?)
         }
     }
@@ -98,11 +101,12 @@ struct ToFile<'a> {
 }
 
 impl Sink for ToFile<'_> {
-    fn push(&mut self, entry: Entry) {
+    fn push(&mut self, entry: Entry) -> bool {
         if self.error.is_none() {
             self.entries += 1;
             self.error = self.segment.write(&entry).err();
         }
+        true
     }
 
     /// A replay deletes nothing, so that nothing needs to be kept.

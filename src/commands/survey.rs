@@ -11,21 +11,17 @@ use crate::features::Descriptor;
 use crate::map::{PERTURBED_COPIES, Recipe};
 use crate::recording::Recording;
 use crate::train::{Survey, SurveyOptions, TrialError};
-use crate::types::PositionM;
+use crate::types::{PositionM, distance_m};
 
 /// Learning takes time with the third power of the number of frames: more than this many are thinned out.
 const MAX_FRAMES: usize = 800;
 
-/// Opens `paths`, all of which must be usable, and counts their positions from the origin of the first.
+/// Opens `paths`, all of which must be usable.
 ///
 /// Of frames closer than `spacing_m` to the one before, only the first is kept. Without it, a drive of more than
 /// [`MAX_FRAMES`] frames is thinned to about that many.
 pub fn open_recordings(paths: &[PathBuf], spacing_m: Option<f64>) -> anyhow::Result<Vec<Recording>> {
     let mut recordings = open_all(paths)?;
-    if let Some(origin) = recordings.first().and_then(|first| first.origin) {
-        // One that does not know its own origin is refused where they are put together.
-        recordings.iter_mut().for_each(|recording| _ = recording.move_origin(origin));
-    }
     let frames = recordings.iter().map(|recording| recording.survey.len()).sum::<usize>();
     let spacing_m = match spacing_m {
         Some(spacing_m) => spacing_m,
@@ -37,6 +33,30 @@ pub fn open_recordings(paths: &[PathBuf], spacing_m: Option<f64>) -> anyhow::Res
         }
     };
     recordings.iter_mut().for_each(|recording| recording.keep_spaced(spacing_m));
+    Ok(recordings)
+}
+
+/// Recordings further apart than this are not of one place \[m\].
+const ONE_PLACE_M: f64 = 50_000.0;
+
+/// Counts the positions of all recordings from the origin of the first.
+///
+/// # Errors
+/// They are not of one place.
+pub fn in_one_place(mut recordings: Vec<Recording>) -> Result<Vec<Recording>, BadArgument> {
+    if let Some(origin) = recordings.first().and_then(|first| first.origin) {
+        // One that does not know its own origin is refused where they are put together.
+        recordings.iter_mut().for_each(|recording| _ = recording.move_origin(origin));
+    }
+    let Some((first, others)) = recordings.split_first() else { return Ok(recordings) };
+    for other in others {
+        let apart_m = distance_m(first.survey[0].position_m, other.survey[0].position_m);
+        if apart_m > ONE_PLACE_M {
+            let (first, other) = (first.path.display(), other.path.display());
+            let apart_km = apart_m / 1000.0;
+            return Err(BadArgument(format!("{first} and {other} lie {apart_km:.0} km apart: a map is of one place")));
+        }
+    }
     Ok(recordings)
 }
 

@@ -7,7 +7,7 @@ use super::map_report;
 use super::options::{OutputKind, check_not_input, check_output};
 use super::progress::Progress;
 use super::survey::{
-    bad_argument, default_grid_step_m, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
+    bad_argument, default_grid_step_m, in_one_place, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
 };
 use super::{DONE, print};
 use crate::features::Descriptor;
@@ -67,7 +67,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Some(selection) => recipe.with_selection(selection),
         None => recipe,
     };
-    let recordings = open_recordings(&args.recordings, args.spacing_m)?;
+    let recordings = in_one_place(open_recordings(&args.recordings, args.spacing_m)?)?;
     let progress = Progress::new();
     let survey = read_to_learn(&recordings, std::slice::from_ref(&recipe), false, &progress)?;
     let settings = TrainSettings {

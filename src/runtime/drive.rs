@@ -3,6 +3,10 @@
 use std::{fs, path::Path, sync::Arc, thread::JoinHandle, time::Duration};
 
 use anyhow::Context;
+use rustix::{
+    fs::{Access, access},
+    io::Errno,
+};
 
 pub use super::live::DriveReport;
 use super::live::{self, DeviceRun, Devices, DriveSettings};
@@ -66,7 +70,14 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
     head.name_source(&name);
     let log_offset_ns = head.log_offset_ns;
     let storage = Folder::new(&config.recorder.folder)
-        .with_context(|| format!("making the folder {}", config.recorder.folder.display()))?;
+        .with_context(|| format!("using the folder {}", config.recorder.folder.display()))?;
+    // A read-only file system may become writable again; a folder of somebody else does not.
+    if access(&config.recorder.folder, Access::WRITE_OK) == Err(Errno::ACCESS) {
+        anyhow::bail!(
+            "{}: this user may not write here: change its owner (chown) or `folder` in [recorder]",
+            config.recorder.folder.display()
+        );
+    }
     let recorder = Recorder::start(config.recorder.clone(), head, &boot_id, Arc::new(storage), clock.clone())?;
 
     let ports = tempfile::tempdir().context("making a folder for pseudo-terminals")?;

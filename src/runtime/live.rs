@@ -77,12 +77,15 @@ pub struct DriveReport {
     pub recorder: RecorderReport,
     /// Where the recording is.
     pub folder: PathBuf,
+    /// Frames were asked for.
+    pub has_camera: bool,
 }
 
 impl DriveReport {
     /// Every frame that the camera exposed and everything else that was said is on the disk.
     pub fn is_lossless(&self) -> bool {
-        self.status.frames_dropped == 0 && self.recorder.is_complete && self.recorder.health.lost == 0
+        let nothing_came = self.has_camera && self.status.frames == 0;
+        self.status.frames_dropped == 0 && self.recorder.is_complete && self.recorder.health.lost == 0 && !nothing_came
     }
 }
 
@@ -115,9 +118,8 @@ impl Clone for Inlet {
 struct ToRecorder<'a>(&'a RecorderHandle);
 
 impl Sink for ToRecorder<'_> {
-    fn push(&mut self, entry: Entry) {
-        // What finds no room is counted and written down by the recorder.
-        self.0.push(entry);
+    fn push(&mut self, entry: Entry) -> bool {
+        self.0.push(entry)
     }
 
     fn mark(&mut self) {
@@ -137,6 +139,7 @@ pub async fn run(
 ) -> anyhow::Result<DriveReport> {
     let mut terminate = signal(SignalKind::terminate()).context("listening for SIGTERM")?;
     let mut interrupt = signal(SignalKind::interrupt()).context("listening for SIGINT")?;
+    let mut hangup = signal(SignalKind::hangup()).context("listening for SIGHUP")?;
     let mut mark = signal(SignalKind::user_defined1()).context("listening for SIGUSR1")?;
 
     let stop = Stop::default();
@@ -182,6 +185,7 @@ pub async fn run(
             }
             _ = terminate.recv() => { info!(signal = "SIGTERM", "stopping"); break; }
             _ = interrupt.recv() => { info!(signal = "SIGINT", "stopping"); break; }
+            _ = hangup.recv() => { info!(signal = "SIGHUP", "stopping"); break; }
             _ = mark.recv() => { info!(signal = "SIGUSR1", "this piece of the recording is kept"); handle.mark(); }
         }
     }
@@ -200,7 +204,12 @@ pub async fn run(
     let status = survey.status().clone();
     let recorder = tokio::task::spawn_blocking(move || recorder.finish(STOP_LIMIT - DEVICES_STOP_LIMIT)).await;
     settings.led.show(LedPattern::Off);
-    Ok(DriveReport { status, recorder: recorder.context("finishing the recording")?, folder: settings.folder })
+    Ok(DriveReport {
+        status,
+        recorder: recorder.context("finishing the recording")?,
+        folder: settings.folder,
+        has_camera: devices_there.0,
+    })
 }
 
 /// What the lamp shows: a fault of the disk before devices that are waited for.

@@ -37,6 +37,12 @@ impl DeviceState {
         }
     }
 
+    /// A device that could be opened is there; whether it says something is another matter.
+    fn open(&mut self) {
+        self.opened += 1;
+        self.failure = self.failure.filter(|failure| ["silent", "bad data"].contains(failure));
+    }
+
     fn heard(&mut self, stamp_ns: u64) {
         self.last_heard_ns = Some(stamp_ns);
         self.failure = None;
@@ -70,13 +76,11 @@ impl StatusCounter {
     }
 
     pub fn camera_opened(&mut self) {
-        self.camera.opened += 1;
-        self.camera.failure = None;
+        self.camera.open();
     }
 
     pub fn gnss_opened(&mut self) {
-        self.gnss.opened += 1;
-        self.gnss.failure = None;
+        self.gnss.open();
     }
 
     pub fn device(&mut self, device: Device, health: Option<&'static str>) {
@@ -144,7 +148,9 @@ impl StatusCounter {
     fn gnss_health(&self, now_ns: u64) -> &'static str {
         match self.gnss.health(now_ns) {
             "ok" if self.searching => "no fix",
-            "silent" | "waiting" if self.last_bytes_ns.is_some_and(|last_ns| last_ns + HEARD_NS >= now_ns) => {
+            "silent" | "waiting" | "bad data"
+                if self.last_bytes_ns.is_some_and(|last_ns| last_ns + HEARD_NS >= now_ns) =>
+            {
                 "unreadable"
             }
             health => health,

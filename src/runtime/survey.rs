@@ -29,6 +29,9 @@ use crate::{
 /// Realtime that moves by more than this against the monotonic clock within a second was set [ns].
 const CLOCK_STEP_NS: u64 = 100_000_000;
 
+/// Why a pair may not be used whose frame found no room.
+const NOT_RECORDED: &str = "not recorded";
+
 /// Something that happened.
 #[derive(Debug)]
 pub enum Input {
@@ -64,7 +67,8 @@ pub struct Tick {
 
 /// Where the drive is recorded.
 pub trait Sink {
-    fn push(&mut self, entry: Entry);
+    /// `false`: there was no room for it. Whoever records says so in the recording.
+    fn push(&mut self, entry: Entry) -> bool;
     /// Keep what is being recorded.
     fn mark(&mut self);
 }
@@ -166,12 +170,16 @@ impl Survey {
         let sequence = frame.sequence.wrapping_add(shift);
         self.next_frame = sequence.wrapping_add(1);
         self.status.frame(frame.stamp_ns, frame.damage.is_some());
-        self.synchronizer.push_frame(sequence.into(), frame.stamp_ns, frame.damage);
         if let Some(reason) = frame.damage {
             out.push(Entry::Lost(Loss::one(&topics::CAMERA_IMAGE, reason, frame.stamp_ns)));
         }
         // A damaged frame is recorded too: whoever looks at it later sees what the camera sent.
-        out.push(Entry::Image { sequence, stamp_ns: frame.stamp_ns, jpeg: frame.jpeg });
+        let is_recorded = out.push(Entry::Image { sequence, stamp_ns: frame.stamp_ns, jpeg: frame.jpeg });
+        if !is_recorded {
+            self.status.lost(&topics::CAMERA_IMAGE, 1);
+        }
+        let damage = if is_recorded { frame.damage } else { Some(NOT_RECORDED) };
+        self.synchronizer.push_frame(sequence.into(), frame.stamp_ns, damage);
         self.poll(frame.arrival_ns, out);
     }
 
@@ -266,7 +274,7 @@ impl Survey {
             self.status.pair(&pair, now_ns);
             let (pair, pose) = self.encoder.pair(pair.sequence as u32, pair.stamp_ns, pair.to_message());
             out.push(pair);
-            pose.into_iter().for_each(|pose| out.push(pose));
+            pose.into_iter().for_each(|pose| _ = out.push(pose));
         }
     }
 

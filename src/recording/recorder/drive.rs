@@ -86,6 +86,8 @@ pub struct DriveWriter {
     uncut: Vec<(SegmentName, Appender, u64)>,
     /// Cut segments that nobody has been told of.
     abandoned: Vec<SegmentName>,
+    /// Somebody took away a file that was being written.
+    has_vanished: bool,
     facts: Facts,
 }
 
@@ -161,6 +163,7 @@ impl DriveWriter {
             marks: Vec::new(),
             uncut: Vec::new(),
             abandoned: Vec::new(),
+            has_vanished: false,
             facts: Facts::default(),
         })
     }
@@ -228,7 +231,7 @@ impl DriveWriter {
             }
         }
         self.cut_abandoned();
-        self.pending() == 0 && self.losses.is_empty()
+        self.pending() == 0 && self.losses.is_empty() && !self.has_vanished
     }
 
     /// Bytes of entries that are no longer kept, since the last call.
@@ -482,7 +485,8 @@ impl DriveWriter {
         match outcome {
             Ok(()) => info!(segment = finished, "segment finished"),
             Err(error) => {
-                // Nothing is lost: its entries are synced, and it will be mended.
+                // Nothing is lost: its entries are synced, and it will be mended; unless somebody took the file away.
+                self.has_vanished |= error.kind() == io::ErrorKind::NotFound;
                 warn!(segment = open, %error, "segment could not be finished");
                 self.abandoned.push(name);
             }

@@ -107,7 +107,15 @@ impl SegmentFile for File {
 
 impl Storage for Folder {
     fn create(&self, name: &str) -> io::Result<Box<dyn SegmentFile>> {
-        Ok(Box::new(OpenOptions::new().append(true).create_new(true).open(self.path.join(name))?))
+        let create = || OpenOptions::new().append(true).create_new(true).open(self.path.join(name));
+        let file = match create() {
+            // Somebody took the folder away.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                fs::create_dir_all(&self.path).and_then(|()| create())?
+            }
+            outcome => outcome?,
+        };
+        Ok(Box::new(file))
     }
 
     fn open(&self, name: &str) -> io::Result<Box<dyn ReadSeek>> {
