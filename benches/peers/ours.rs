@@ -75,7 +75,7 @@ impl Chain {
         let mut properties = vec![Describer::room_for(&Descriptor::PAPER); self.jpegs.len()];
         let start = cpu_s();
         for (jpeg, properties) in self.jpegs.iter().zip(&mut properties) {
-            let image = self.decoder.decode(jpeg)?;
+            let image = self.decoder.decode_needed(jpeg, self.table.needed())?;
             self.table.unwrap_into(image, 0, &mut self.panorama);
             self.describer.describe(&Descriptor::PAPER, &self.panorama, properties);
         }

@@ -4,8 +4,8 @@ use std::f64::consts::TAU;
 
 use multiversion::multiversion;
 
-use super::{Panorama, SAMPLED_COLUMNS, SAMPLED_ROWS, WIDE_COLUMNS};
-use crate::types::{AzimuthSense, CalibrationError, DonutCalibration, LumaImage};
+use super::{Panorama, SAMPLED_COLUMNS, SAMPLED_ROWS, WIDE_COLUMNS, WIDE_ROWS};
+use crate::types::{AzimuthSense, CalibrationError, DonutCalibration, LumaImage, Tiles};
 
 /// Where in the camera image every sample of the panorama lies.
 ///
@@ -27,8 +27,10 @@ pub struct UnwrapTable {
     /// Sub-samples a sample, in azimuth and in radius.
     sub_columns: usize,
     sub_rows: usize,
-    /// `K·sub_rows × J·sub_columns` samples, row-major.
+    /// Tile × row × column: `K·sub_rows` rows of `J·sub_columns` columns, in tiles of [`TILE_COLUMNS`]` · sub_columns`.
     samples: Vec<Sample>,
+    /// What they are interpolated from.
+    needed: Tiles,
 }
 
 /// A bilinear sample: the top left of four neighbouring pixels and the weights of the right and the lower ones, in steps
@@ -40,8 +42,11 @@ struct Sample {
     below: u16,
 }
 
+/// Columns unwrapped at a time, from rim to rim: so many that the camera pixels of one row are still in the fastest cache
+/// when the next needs them.
+const TILE_COLUMNS: usize = 64;
 /// Samples interpolated at a time: their pixels are gathered first, one by one, and then weighed many at once.
-const GATHERED: usize = 256;
+const GATHERED: usize = 2 * TILE_COLUMNS;
 
 /// Bilinear samples further apart than this skip pixels \[px\].
 const MAX_SPACING_PX: f64 = 2.1;
@@ -66,15 +71,24 @@ impl UnwrapTable {
             })
             .collect();
         let mut samples = Vec::with_capacity(columns * rows);
-        for k in 0..rows {
-            let fraction = (k as f64 + 0.5) / rows as f64;
-            let inwards = if donut.top_is_outer { fraction } else { 1.0 - fraction };
-            let radius_px = donut.outer_radius_px - (donut.outer_radius_px - donut.inner_radius_px) * inwards;
-            samples.extend(directions.iter().map(|(cos, sin)| {
-                let x = donut.center_x_px + radius_px * cos;
-                let y = donut.center_y_px + radius_px * sin;
-                Sample::at(x, y, width_px, height_px)
-            }));
+        for directions in directions.chunks_exact(TILE_COLUMNS * sub_columns) {
+            for k in 0..rows {
+                let fraction = (k as f64 + 0.5) / rows as f64;
+                let inwards = if donut.top_is_outer { fraction } else { 1.0 - fraction };
+                let radius_px = donut.outer_radius_px - (donut.outer_radius_px - donut.inner_radius_px) * inwards;
+                samples.extend(directions.iter().map(|(cos, sin)| {
+                    let x = donut.center_x_px + radius_px * cos;
+                    let y = donut.center_y_px + radius_px * sin;
+                    Sample::at(x, y, width_px, height_px)
+                }));
+            }
+        }
+        let mut needed = Tiles::none(width_px, height_px);
+        for sample in &samples {
+            let (left, top) = (sample.index as usize % width_px, sample.index as usize / width_px);
+            for (x, y) in [(left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)] {
+                needed.add_pixel(x, y);
+            }
         }
         Ok(Self {
             image_width_px: width_px,
@@ -83,7 +97,13 @@ impl UnwrapTable {
             sub_columns,
             sub_rows,
             samples,
+            needed,
         })
+    }
+
+    /// The part of the images that this table reads: all the decoder has to provide.
+    pub fn needed(&self) -> &Tiles {
+        &self.needed
     }
 
     /// Width and height of the images that this table unwraps.
@@ -117,25 +137,30 @@ impl UnwrapTable {
     /// As [`to_panorama`](Self::to_panorama).
     pub fn unwrap_into(&self, image: &LumaImage, shift_columns: usize, panorama: &mut Panorama) {
         assert_eq!((image.width_px, image.height_px), self.image_size_px(), "the table is for another image size");
-        let shift = shift_columns % SAMPLED_COLUMNS;
-        let mut row = [0.0_f32; SAMPLED_COLUMNS];
-        let mut sampled = vec![0.0_f32; if self.sub_columns > 1 { SAMPLED_COLUMNS * self.sub_columns } else { 0 }];
-        let columns = SAMPLED_COLUMNS * self.sub_columns;
         panorama.column_means.fill(0.0);
         panorama.wide.fill(0.0);
-
-        for (k, samples) in self.samples.chunks_exact(columns).enumerate() {
-            if self.sub_columns == 1 {
-                sample_row(samples, &image.pixels, self.image_width_px, &mut row);
-            } else {
-                sample_row(samples, &image.pixels, self.image_width_px, &mut sampled);
-                for (mean, group) in row.iter_mut().zip(sampled.chunks_exact(self.sub_columns)) {
-                    *mean = group.iter().sum::<f32>() / self.sub_columns as f32;
-                }
+        let per_wide_row = 2 * self.sub_rows * self.sub_columns * TILE_COLUMNS;
+        let (mut values, mut means) = (vec![0.0; per_wide_row], vec![0.0; per_wide_row / self.sub_columns]);
+        for (tile, samples) in self.samples.chunks_exact(WIDE_ROWS * per_wide_row).enumerate() {
+            let first_column = (tile * TILE_COLUMNS + shift_columns) % SAMPLED_COLUMNS;
+            let mut column_sums = [0.0; TILE_COLUMNS];
+            for (samples, wide) in samples.chunks_exact(per_wide_row).zip(panorama.wide.chunks_exact_mut(WIDE_COLUMNS))
+            {
+                sample_pixels(samples, &image.pixels, self.image_width_px, &mut values);
+                let sums = if self.sub_columns == 1 {
+                    sums_of_rows(&values)
+                } else {
+                    for (mean, group) in means.iter_mut().zip(values.chunks_exact(self.sub_columns)) {
+                        *mean = group.iter().sum::<f32>() / self.sub_columns as f32;
+                    }
+                    sums_of_rows(&means)
+                };
+                column_sums.iter_mut().zip(&sums).for_each(|(column, sum)| *column += sum);
+                add_in_pairs(&sums, first_column, wide);
             }
-            row.rotate_right(shift);
-            let wide_row = k / self.sub_rows / 2;
-            add_row(&row, &mut panorama.column_means, &mut panorama.wide[wide_row * WIDE_COLUMNS..][..WIDE_COLUMNS]);
+            for (j, sum) in column_sums.iter().enumerate() {
+                panorama.column_means[(first_column + j) % SAMPLED_COLUMNS] = *sum;
+            }
         }
         let rows = (SAMPLED_ROWS * self.sub_rows) as f32;
         panorama.column_means.iter_mut().for_each(|mean| *mean /= rows);
@@ -160,7 +185,7 @@ impl Sample {
 
 /// Interpolates `samples` in `pixels`, whose rows are `width_px` long.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw", "x86_64+avx2+fma"))]
-fn sample_row(samples: &[Sample], pixels: &[u8], width_px: usize, values: &mut [f32]) {
+fn sample_pixels(samples: &[Sample], pixels: &[u8], width_px: usize, values: &mut [f32]) {
     interpolate(samples, pixels, width_px, values);
 }
 
@@ -185,14 +210,33 @@ fn interpolate<P: Copy + Default + Into<f32>>(samples: &[Sample], pixels: &[P], 
     }
 }
 
-/// Adds one sampled row to the sums over columns and, in pairs, to a row of the wide panorama.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
-fn add_row(row: &[f32; SAMPLED_COLUMNS], column_sums: &mut [f32], wide: &mut [f32]) {
-    for (sum, value) in column_sums.iter_mut().zip(row) {
-        *sum += value;
+/// The sums over all rows, in `values`, of each column of a tile.
+#[inline]
+fn sums_of_rows(values: &[f32]) -> [f32; TILE_COLUMNS] {
+    let mut sums = [0.0; TILE_COLUMNS];
+    for row in values.as_chunks::<TILE_COLUMNS>().0 {
+        sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
     }
-    for (sum, pair) in wide.iter_mut().zip(row.chunks_exact(2)) {
-        *sum += pair[0] + pair[1];
+    sums
+}
+
+/// Adds the columns of a tile, of which the first is column `first` of the panorama, two by two to a row of the wide one.
+fn add_in_pairs(sums: &[f32; TILE_COLUMNS], first: usize, wide: &mut [f32]) {
+    let (mut sums, mut cell) = (&sums[..], first / 2);
+    if first % 2 == 1 {
+        // The first column of all is the second of its pair, and so the last has none.
+        wide[cell] += sums[0];
+        (sums, cell) = (&sums[1..], cell + 1);
+    }
+    let (pairs, last) = sums.as_chunks::<2>();
+    let (before_wrap, after_wrap) = pairs.split_at(pairs.len().min(WIDE_COLUMNS - cell));
+    let add = |wide: &mut [f32], pairs: &[[f32; 2]]| {
+        wide.iter_mut().zip(pairs).for_each(|(cell, pair)| *cell += pair[0] + pair[1]);
+    };
+    add(&mut wide[cell..], before_wrap);
+    add(wide, after_wrap);
+    if let [last] = last {
+        wide[(cell + pairs.len()) % WIDE_COLUMNS] += last;
     }
 }
 
@@ -299,6 +343,24 @@ mod tests {
             table.unwrap_into(&lighthouse(-yaw_rad), table.columns_to_east(yaw_rad), &mut panorama);
             let column = brightest_column(&panorama);
             assert!(column.min(SAMPLED_COLUMNS - column) < 20, "yaw {yaw_rad}: east at column {column}");
+        }
+    }
+
+    #[test]
+    fn a_shift_turns_all_sizes_alike() {
+        let table = UnwrapTable::build(&donut(), 200, 180).expect("inside");
+        let image = lighthouse(0.4);
+        let (unturned, mut panorama) = (table.to_panorama(&image), Panorama::zeros());
+        for shift in [0, 1, 2, 7, 63, 64, 65, 130, 1022, 1023, 1024 + 5] {
+            table.unwrap_into(&image, shift, &mut panorama);
+            let mut expected = unturned.column_means.clone();
+            expected.rotate_right(shift % SAMPLED_COLUMNS);
+            assert_eq!(panorama.column_means, expected, "shift {shift}");
+            // In this image brightness depends on the direction alone, but for the steps of its pixels.
+            for (i, &cell) in panorama.wide.iter().enumerate() {
+                let pair = &expected[2 * (i % WIDE_COLUMNS)..][..2];
+                assert!((cell - 0.5 * (pair[0] + pair[1])).abs() < 4.0, "shift {shift}, cell {i}: {cell} {pair:?}");
+            }
         }
     }
 

@@ -168,7 +168,7 @@ impl Survey {
             .map_init(
                 || (LumaDecoder::new(), Describer::new(), Panorama::zeros()),
                 |(decoder, describer, panorama), (i, (frame, jpeg))| {
-                    let image = decoder.decode(jpeg).map_err(in_frame(frame.index))?;
+                    let image = decoder.decode_needed(jpeg, table.needed()).map_err(in_frame(frame.index))?;
                     let found = (image.width_px, image.height_px);
                     if found != size_px {
                         let (recording, index) = (name(), frame.index);
