@@ -271,8 +271,8 @@ impl RotationTracker {
             let (mut bend, mut slope) = (0.0, 0.0);
             let mut rings = [(0.0, 0.0); RINGS];
             for (ring, side) in rings.iter_mut().enumerate() {
-                self.to_columns(from, ring, 0.0, 0);
-                self.to_columns(to, ring, shift_rad, 1);
+                self.fill_columns(from, ring, 0.0, 0);
+                self.fill_columns(to, ring, shift_rad, 1);
                 let [a, a_slope, b, b_slope] = &self.columns;
                 let of_column = |j: usize| (a[j] - b[j], 0.5 * (a_slope[j] + b_slope[j]), self.sideways[j]);
                 let misfit = |j: usize| {
@@ -313,7 +313,7 @@ impl RotationTracker {
     }
 
     /// A ring's values and slopes, with its columns moved by `shift_rad`, to `columns[2 * place..]`.
-    fn to_columns(&mut self, profile: &Profile, ring: usize, shift_rad: f64, place: usize) {
+    fn fill_columns(&mut self, profile: &Profile, ring: usize, shift_rad: f64, place: usize) {
         let harmonics = &profile.spectra[ring * USED.len()..(ring + 1) * USED.len()];
         let step = Complex::from_polar(1.0, shift_rad);
         for (is_slope, columns) in self.columns[2 * place..2 * place + 2].iter_mut().enumerate() {
