@@ -23,6 +23,10 @@ const MAX_HEADING_HZ: f64 = 50.0;
 const PIECES: usize = 8;
 /// Frames looked at: one in so many seconds, every second one of 30 a second.
 const FRAME_INTERVAL_S: f64 = 0.06;
+/// So many turns show by their spread how well each is seen. For fewer it is assumed: what is left of parallax shifts a
+/// right-angled turn between houses by this much.
+const SPREADING_TURNS: usize = 3;
+const TURN_STD_S: f64 = 0.05;
 
 /// By how much pairs and pictures disagree.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -74,7 +78,10 @@ pub fn latency_from_recording(
             lag.push(piece);
         }
     }
-    let found = |LagEstimate { lag_s, std_s, turns }| RecordedLag { late_s: lag_s, std_s, turns };
+    let found = |LagEstimate { lag_s, std_s, turns }| {
+        let unseen_s = if turns < SPREADING_TURNS { TURN_STD_S / (turns as f64).sqrt() } else { 0.0 };
+        RecordedLag { late_s: lag_s, std_s: std_s.hypot(unseen_s), turns }
+    };
     Ok(lag.estimate().map(found))
 }
 
@@ -208,8 +215,15 @@ impl CameraYaw {
 mod tests {
     use std::{f64::consts::TAU, fs, io::Cursor};
 
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
     use super::*;
-    use crate::{recording::RecordingWriter, types::wrap_angle_rad};
+    use crate::{
+        recording::RecordingWriter,
+        types::wrap_angle_rad,
+        world::{Camera, Day, Drive, DriveSettings, Renderer, World},
+    };
 
     const DONUT: &str = r#"{"kind": "donut", "cx": 79.5, "cy": 79.5, "r_in": 20.0, "r_out": 76.0, "top_is_outer": true,
         "start_angle": 0.4, "clockwise": true, "azimuth": "cw"}"#;
@@ -289,5 +303,47 @@ mod tests {
         let recording = Recording::open_any(&path).expect("sound");
         let lag = latency_from_recording(&recording, |_, _| panic!("nothing to look at"));
         assert_eq!(lag.expect("sound"), None, "a yaw a second says nothing");
+    }
+
+    /// What the camera and the receiver of a vehicle in the simulated town record, with headings of 50 Hz and 0.4°.
+    fn record_town(path: &Path, drive: &Drive, world: &World, from_s: f64, to_s: f64, late_s: f64) {
+        let camera = Camera::town().scaled_to(320, 180);
+        let mut recording = RecordingWriter::new(Cursor::new(Vec::new())).expect("starts");
+        let donut = serde_json::to_vec(&camera.donut).expect("plain numbers");
+        recording.attach("donut.json", "application/json", 0, &donut).expect("attaches");
+        let ns = |time_s: f64| 1_000_000_000_000 + ((time_s - from_s) * 1e9) as u64;
+        let mut random = ChaCha8Rng::seed_from_u64(5);
+        for i in 0..((to_s - from_s) * 50.0) as u32 {
+            let time_s = from_s + f64::from(i) / 50.0;
+            let noise_rad = random.random_range(-0.012..0.012);
+            let yaw_rad = wrap_angle_rad(drive.pose_at(time_s).yaw_rad + noise_rad);
+            let heading = omniloc::Heading { timestamp: None, yaw_rad, source: "HDT".into(), yaw_std_rad: None };
+            recording.write(&topics::GNSS_HEADING, i, ns(time_s + late_s), &heading).expect("writes");
+        }
+        let mut renderer = Renderer::new(world, &Day::new(2), &camera).expect("sound");
+        let mut jpeg = Vec::new();
+        for frame in 0..((to_s - from_s) * 10.0) as u32 {
+            let time_s = from_s + f64::from(frame) / 10.0;
+            renderer.render_jpeg(&drive.pose_at(time_s), time_s, &mut jpeg);
+            recording.write_image(frame, ns(time_s), &jpeg).expect("writes");
+        }
+        fs::write(path, recording.finish().expect("finishes").into_inner()).expect("writes");
+    }
+
+    #[test]
+    fn turns_are_found_between_houses_that_pass_by() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("drive.mcap");
+        let world = World::town_block(3);
+        let lag = |speed_factor: f64, from_s: f64, to_s: f64| {
+            let drive = Drive::new(&world, &DriveSettings { seed: 3, speed_factor, ..DriveSettings::default() });
+            record_town(&path, &drive, &world, from_s, to_s, 0.08);
+            latency_from_recording(&Recording::open_any(&path).expect("sound"), |_, _| ()).expect("sound")
+        };
+        let corners = lag(1.0, 5.8, 39.8).expect("turns enough");
+        println!("headings 0.08 s late: {corners:?}");
+        assert!((corners.late_s - 0.08).abs() < 0.015 && corners.turns == 2, "{corners:?}");
+        assert!((0.02..0.05).contains(&corners.std_s), "two turns do not tell more: {corners:?}");
+        assert_eq!(lag(0.5, 6.0, 20.0), None, "straight on");
     }
 }

@@ -34,6 +34,15 @@ const LEARNING_SHIFT_RAD: f64 = 2.0 * TAU / WIDE_COLUMNS as f64;
 const LEARNING_RATE: f64 = 0.1;
 /// Steps of Newton's method from the highest column to the peak; two are enough.
 const NEWTON_STEPS: usize = 3;
+/// Steps of Gauss-Newton from there to what is left without parallax, and the longest: two columns.
+const PARALLAX_STEPS: usize = 6;
+const MAX_STEP_RAD: f64 = 0.025;
+/// The parallax of one ring is known a little less well than its columns say.
+const PARALLAX_DAMPING: f64 = 0.05;
+/// A column that fits this many times worse than the mean (in squares) counts half.
+const TOLERATED_MISFIT: f64 = 2.25;
+/// Parallax does not move the peak further than this: six columns.
+const MAX_PARALLAX_RAD: f64 = 0.075;
 
 /// How the vehicle turned between two frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,18 +57,26 @@ pub struct VisualRotation {
 
 /// Compares each frame with the one before.
 ///
-/// Turning the vehicle shifts the columns of the panorama. With Aᵣ and Bᵣ the spectra of ring r of the two frames, less
-/// the slow and the very fast harmonics, the correlation at a shift of s columns is
+/// Turning the vehicle shifts the columns of the panorama. Driving on shifts them too, by v/d · sin φ at the angle φ from
+/// ahead, where things are d away: with houses on one side and a wide street on the other, a straight drive looks like a
+/// turn of 0.2 rad/s. Ahead and behind it does not, so that columns count by cos⁴ φ; column 0 looks ahead, as
+/// [`AzimuthSense`] has it.
+///
+/// With Aᵣ and Bᵣ the spectra of ring r of the two frames, less the slow and the very fast harmonics, and A′ᵣ and B′ᵣ
+/// those of the same rings times cos⁴ φ, the correlation at a shift of s columns is
 ///
 /// ```text
-/// c(s) = Σᵣ wᵣ Σₖ Re(Aᵣₖ* Bᵣₖ e^{2πi k s / W}) / √(Σ w|A|² Σ w|B|²)
+/// c(s) = Σᵣ wᵣ Σₖ ½ Re((A′ᵣₖ* Bᵣₖ + Aᵣₖ* B′ᵣₖ) e^{2πi k s / W}) / √(Σ w Re(A′* A) Σ w Re(B′* B))
 /// ```
+///
+/// One term alone would lean to where the image is rich, just beside what counts; the two lean to opposite sides.
 ///
 /// Rings around the horizon see what is far away, rings below and above it the road and façades that pass by, or the
 /// vehicle itself. Which is which is learnt: w is the fourth power of a ring's own mean correlation in turns.
 ///
 /// Its highest column comes from one inverse transform, its peak between columns from Newton's method on the sum itself,
-/// which is exact: no error that depends on where between two columns the peak lies.
+/// which is exact: no error that depends on where between two columns the peak lies. From there, parallax is fitted beside
+/// the shift and taken off it, see `without_parallax_rad`.
 pub struct RotationTracker {
     azimuth: AzimuthSense,
     forward: Arc<dyn RealToComplex<f64>>,
@@ -69,6 +86,12 @@ pub struct RotationTracker {
     spectrum: Vec<Complex<f64>>,
     correlation: Vec<f64>,
     scratch: Vec<Complex<f64>>,
+    /// What columns count, and the scale of a transform forth and back.
+    along: Vec<f64>,
+    /// How much parallax shifts them.
+    sideways: Vec<f64>,
+    /// Values and slopes of a ring in the two frames.
+    columns: [Vec<f64>; 4],
     /// How well each ring fits the turns that were found, and what that makes it count.
     agreement: [f64; RINGS],
     weights: [f64; RINGS],
@@ -81,6 +104,8 @@ pub struct RotationTracker {
 struct Profile {
     stamp_ns: u64,
     spectra: Vec<Complex<f64>>,
+    /// Of the rings times what their columns count.
+    along: Vec<Complex<f64>>,
     energies: [f64; RINGS],
 }
 
@@ -98,6 +123,13 @@ impl RotationTracker {
             spectrum: forward.make_output_vec(),
             correlation: inverse.make_output_vec(),
             scratch: vec![Complex::ZERO; scratch_length],
+            sideways: (0..WIDE_COLUMNS)
+                .map(|column| (TAU * (column as f64 + 0.5) / WIDE_COLUMNS as f64).sin().abs())
+                .collect(),
+            columns: std::array::from_fn(|_| vec![0.0; WIDE_COLUMNS]),
+            along: (0..WIDE_COLUMNS)
+                .map(|column| (TAU * (column as f64 + 0.5) / WIDE_COLUMNS as f64).cos().powi(4) / WIDE_COLUMNS as f64)
+                .collect(),
             forward,
             inverse,
             agreement: [1.0; RINGS],
@@ -137,8 +169,8 @@ impl RotationTracker {
     fn describe(&mut self, stamp_ns: u64, panorama: &Panorama, profile: &mut Profile) {
         profile.stamp_ns = stamp_ns;
         let rings = panorama.wide.chunks_exact(WIDE_COLUMNS * ROWS_PER_RING);
-        let spectra = profile.spectra.chunks_exact_mut(USED.len());
-        for (rows, (spectrum, energy)) in rings.zip(spectra.zip(&mut profile.energies)) {
+        let spectra = profile.spectra.chunks_exact_mut(USED.len()).zip(profile.along.chunks_exact_mut(USED.len()));
+        for (rows, ((spectrum, along), energy)) in rings.zip(spectra.zip(&mut profile.energies)) {
             self.ring.fill(0.0);
             for row in rows.chunks_exact(WIDE_COLUMNS) {
                 self.ring.iter_mut().zip(row).for_each(|(sum, &value)| *sum += f64::from(value));
@@ -147,7 +179,17 @@ impl RotationTracker {
                 .process_with_scratch(&mut self.ring, &mut self.spectrum, &mut self.scratch)
                 .expect("the buffers come from the plan");
             spectrum.copy_from_slice(&self.spectrum[USED]);
-            *energy = spectrum.iter().map(Complex::norm_sqr).sum();
+            self.spectrum[..USED.start].fill(Complex::ZERO);
+            self.spectrum[USED.end..].fill(Complex::ZERO);
+            self.inverse
+                .process_with_scratch(&mut self.spectrum, &mut self.ring, &mut self.scratch)
+                .expect("the buffers come from the plan");
+            self.ring.iter_mut().zip(&self.along).for_each(|(value, factor)| *value *= factor);
+            self.forward
+                .process_with_scratch(&mut self.ring, &mut self.spectrum, &mut self.scratch)
+                .expect("the buffers come from the plan");
+            along.copy_from_slice(&self.spectrum[USED]);
+            *energy = along.iter().zip(&*spectrum).map(|(a, b)| (a.conj() * b).re).sum();
         }
     }
 
@@ -161,9 +203,9 @@ impl RotationTracker {
         }
         self.cross.fill(Complex::ZERO);
         let used = &mut self.cross[USED];
-        for (weight, (a, b)) in self.weights.iter().zip(rings(from).zip(rings(to))) {
+        for (ring, weight) in self.weights.iter().enumerate() {
             let factor = weight / scale;
-            used.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum += a.conj() * b * factor);
+            used.iter_mut().zip(products(from, to, ring)).for_each(|(sum, product)| *sum += product * factor);
         }
         let mut spectrum = std::mem::take(&mut self.spectrum);
         spectrum.copy_from_slice(&self.cross);
@@ -185,6 +227,7 @@ impl RotationTracker {
             return None;
         }
         let shift_rad = self.peak_near_rad(TAU * column as f64 / WIDE_COLUMNS as f64);
+        let shift_rad = self.without_parallax_rad(from, to, shift_rad);
         self.learn_weights(from, to, shift_rad);
         // What the vehicle turns towards moves to lower columns where the azimuth grows with the column.
         let rotation_rad = match self.azimuth {
@@ -202,17 +245,88 @@ impl RotationTracker {
         }
         let step = Complex::from_polar(1.0, shift_rad);
         let first = Complex::from_polar(1.0, shift_rad * USED.start as f64);
-        for (ring, (a, b)) in rings(from).zip(rings(to)).enumerate() {
+        for ring in 0..RINGS {
             let scale = (from.energies[ring] * to.energies[ring]).sqrt();
             let mut turn = first;
             let mut product = 0.0;
-            for (a, b) in a.iter().zip(b) {
-                product += (a.conj() * b * turn).re;
+            for cross in products(from, to, ring) {
+                product += (cross * turn).re;
                 turn *= step;
             }
             let agreement = if scale > 0.0 { (product / scale).clamp(0.0, 1.0) } else { 0.0 };
             self.agreement[ring] += LEARNING_RATE * (agreement - self.agreement[ring]);
             self.weights[ring] = self.agreement[ring].powi(4);
+        }
+    }
+
+    /// The shift that explains the two frames together with parallax, from one near it.
+    ///
+    /// Gauss-Newton on Σ w (a − b)² over all rings and columns. Besides the shift of all, each ring has a shift of its own
+    /// that grows with |sin φ|: what one side is nearer than the other. Columns that fit badly, where cars pass or façades
+    /// end, count less.
+    fn without_parallax_rad(&mut self, from: &Profile, to: &Profile, start_rad: f64) -> f64 {
+        let mut shift_rad = start_rad;
+        let mut parallax_rad = [0.0; RINGS];
+        for _ in 0..PARALLAX_STEPS {
+            let (mut bend, mut slope) = (0.0, 0.0);
+            let mut rings = [(0.0, 0.0); RINGS];
+            for (ring, side) in rings.iter_mut().enumerate() {
+                self.fill_columns(from, ring, 0.0, 0);
+                self.fill_columns(to, ring, shift_rad, 1);
+                let [a, a_slope, b, b_slope] = &self.columns;
+                let of_column = |j: usize| (a[j] - b[j], 0.5 * (a_slope[j] + b_slope[j]), self.sideways[j]);
+                let misfit = |j: usize| {
+                    let (rest, gradient, sideways) = of_column(j);
+                    (rest - gradient * sideways * parallax_rad[ring]).powi(2)
+                };
+                let total: f64 = self.along.iter().enumerate().map(|(j, along)| along * misfit(j)).sum();
+                let tolerated = TOLERATED_MISFIT * total / self.along.iter().sum::<f64>();
+                let (mut gg, mut gs, mut ss, mut g_rest, mut s_rest) = (0.0, 0.0, 0.0, 0.0, 0.0);
+                for (j, along) in self.along.iter().enumerate() {
+                    let (rest, gradient, sideways) = of_column(j);
+                    let weight = if tolerated > 0.0 { along / (1.0 + misfit(j) / tolerated) } else { *along };
+                    let by_side = gradient * sideways;
+                    gg += weight * gradient * gradient;
+                    gs += weight * gradient * by_side;
+                    ss += weight * by_side * by_side;
+                    g_rest += weight * gradient * rest;
+                    s_rest += weight * by_side * rest;
+                }
+                let ss = ss * (1.0 + PARALLAX_DAMPING);
+                if ss > 0.0 {
+                    bend += gg - gs * gs / ss;
+                    slope += g_rest - gs * s_rest / ss;
+                    *side = (s_rest / ss, gs / ss);
+                }
+            }
+            if !(bend > 0.0 && slope.is_finite()) {
+                return start_rad;
+            }
+            let step_rad = (slope / bend).clamp(-MAX_STEP_RAD, MAX_STEP_RAD);
+            for (parallax_rad, (own, shared)) in parallax_rad.iter_mut().zip(rings) {
+                *parallax_rad = own - shared * step_rad;
+            }
+            shift_rad += step_rad;
+        }
+        // The two images match elsewhere: the peak of the correlation is the better answer.
+        if (shift_rad - start_rad).abs() <= MAX_PARALLAX_RAD { shift_rad } else { start_rad }
+    }
+
+    /// A ring's values and slopes, with its columns moved by `shift_rad`, to `columns[2 * place..]`.
+    fn fill_columns(&mut self, profile: &Profile, ring: usize, shift_rad: f64, place: usize) {
+        let harmonics = &profile.spectra[ring * USED.len()..(ring + 1) * USED.len()];
+        let step = Complex::from_polar(1.0, shift_rad);
+        for (is_slope, columns) in self.columns[2 * place..2 * place + 2].iter_mut().enumerate() {
+            self.cross.fill(Complex::ZERO);
+            let mut turn = Complex::from_polar(1.0 / WIDE_COLUMNS as f64, shift_rad * USED.start as f64);
+            for (k, (value, harmonic)) in USED.zip(self.cross[USED].iter_mut().zip(harmonics)) {
+                let factor = if is_slope == 1 { Complex::new(0.0, k as f64) } else { Complex::new(1.0, 0.0) };
+                *value = harmonic * turn * factor;
+                turn *= step;
+            }
+            self.inverse
+                .process_with_scratch(&mut self.cross, columns, &mut self.scratch)
+                .expect("the buffers come from the plan");
         }
     }
 
@@ -239,14 +353,18 @@ impl RotationTracker {
     }
 }
 
-/// The spectrum of each ring.
-fn rings(profile: &Profile) -> std::slice::ChunksExact<'_, Complex<f64>> {
-    profile.spectra.chunks_exact(USED.len())
+/// ½ (A′* B + A* B′) of one ring, for each harmonic.
+fn products<'a>(from: &'a Profile, to: &'a Profile, ring: usize) -> impl Iterator<Item = Complex<f64>> + 'a {
+    let range = ring * USED.len()..(ring + 1) * USED.len();
+    let from = from.spectra[range.clone()].iter().zip(&from.along[range.clone()]);
+    let to = to.spectra[range.clone()].iter().zip(&to.along[range]);
+    from.zip(to).map(|((a, a_along), (b, b_along))| 0.5 * (a_along.conj() * b + a.conj() * b_along))
 }
 
 impl Profile {
     fn zeros() -> Self {
-        Self { stamp_ns: 0, spectra: vec![Complex::ZERO; RINGS * USED.len()], energies: [0.0; RINGS] }
+        let zeros = vec![Complex::ZERO; RINGS * USED.len()];
+        Self { stamp_ns: 0, spectra: zeros.clone(), along: zeros, energies: [0.0; RINGS] }
     }
 }
 
@@ -287,8 +405,8 @@ mod tests {
                 let stamp_ns = i as u64 + 1;
                 let found = tracker.push(stamp_ns, &seen(azimuth, yaw_rad, 30.0, stamp_ns)).expect("clear");
                 assert_eq!((found.from_ns, found.to_ns), (stamp_ns - 1, stamp_ns));
-                // One column is 0.0123 rad.
-                assert!(wrap_angle_rad(found.rotation_rad - turn_rad).abs() < 2e-4, "{found:?}, truth {turn_rad}");
+                // One column is 0.0123 rad. Those to the sides count less and parallax is fitted too: noise is left.
+                assert!(wrap_angle_rad(found.rotation_rad - turn_rad).abs() < 8e-4, "{found:?}, truth {turn_rad}");
                 assert!((0.5..1.01).contains(&found.quality), "{found:?}");
             }
         }
