@@ -93,6 +93,9 @@ fn frames(c: &mut Criterion) {
 
     let mut jpeg = cycle(&jpegs);
     c.bench_function("frame/decode luma", |b| b.iter(|| decoder.decode(jpeg()).map(|image| image.pixels[0])));
+    c.bench_function("frame/decode the luma that is needed", |b| {
+        b.iter(|| decoder.decode_needed(jpeg(), table.needed()).map(|image| image.width_px));
+    });
     let mut image = cycle(&images);
     c.bench_function("frame/unwrap", |b| b.iter(|| table.unwrap_into(image(), 0, black_box(&mut panorama))));
     for descriptor in Descriptor::ALL {
@@ -109,7 +112,7 @@ fn frames(c: &mut Criterion) {
         let mut properties = Describer::room_for(&descriptors);
         c.bench_function(&format!("frame/JPEG to {what}"), |b| {
             b.iter(|| {
-                let image = decoder.decode(jpeg()).expect("a whole JPEG");
+                let image = decoder.decode_needed(jpeg(), table.needed()).expect("a whole JPEG");
                 table.unwrap_into(image, 0, &mut panorama);
                 describer.describe(&descriptors, &panorama, black_box(&mut properties));
             });

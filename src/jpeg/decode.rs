@@ -5,7 +5,8 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-use super::baseline::{Baseline, Header, Refusal};
+use super::baseline::{Baseline, Refusal};
+use super::header::Header;
 use crate::types::{LumaImage, Tiles};
 
 /// Larger images are refused: no camera of ours makes them, and a forged header could claim any size.

@@ -116,3 +116,50 @@ const fn times(value: i32, factor: f64) -> i32 {
 pub fn flat(mean_coefficient: i32) -> u8 {
     ((mean_coefficient.wrapping_add(4) >> 3).wrapping_add(128)).clamp(0, 255) as u8
 }
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use super::*;
+
+    /// T.81, A.3.3, in floating point.
+    fn exact(coefficients: &[i32; 64], x: usize, y: usize) -> f64 {
+        let wave = |frequency: usize, at: usize| {
+            let scale = if frequency == 0 { 0.5_f64.sqrt() } else { 1.0 };
+            scale * ((2 * at + 1) as f64 * frequency as f64 * PI / 16.0).cos()
+        };
+        let sum: f64 = (0..64).map(|i| f64::from(coefficients[i]) * wave(i % 8, x) * wave(i / 8, y)).sum();
+        (0.25 * sum + 128.0).clamp(0.0, 255.0)
+    }
+
+    #[test]
+    fn samples_are_those_of_the_formula() {
+        for seed in 0..200_i32 {
+            let (low, size) = (seed % 2 == 0, 1 << (seed % 9));
+            let mut coefficients = [0; 64];
+            for (i, coefficient) in coefficients.iter_mut().enumerate() {
+                if !low || (i % 8 < HALF && i / 8 < HALF) {
+                    *coefficient = (seed * 7919 + i as i32 * 104_729) % size;
+                }
+            }
+            coefficients[0] = 8 * (seed - 100);
+            for (y, row) in samples(&coefficients, low).iter().enumerate() {
+                for (x, &sample) in row.iter().enumerate() {
+                    let expected = exact(&coefficients, x, y);
+                    // Rounding, and the precision of the constants.
+                    assert!((f64::from(sample) - expected).abs() < 0.8, "seed {seed}: {sample} instead of {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_block_that_is_but_a_mean_is_flat() {
+        for mean in [-100_000, -1025, -1024, -5, -4, 0, 3, 4, 1016, 1020, 100_000] {
+            let mut coefficients = [0; 64];
+            coefficients[0] = mean;
+            assert_eq!(samples(&coefficients, false), [[flat(mean); SIDE]; SIDE], "{mean}");
+        }
+    }
+}

@@ -3,6 +3,7 @@
 mod baseline;
 mod bits;
 mod decode;
+mod header;
 mod huffman;
 mod idct;
 mod markers;

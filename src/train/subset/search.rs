@@ -1,6 +1,6 @@
 //! The best cell of a query without each of the features.
 
-use std::array;
+use std::{array, hint};
 
 use multiversion::multiversion;
 
@@ -267,6 +267,11 @@ fn list_groups(search: &mut Search) {
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn bound_blocks(search: &mut Search) {
     search.reached.clear();
+    let bounds = search
+        .groups
+        .iter()
+        .map(|group| &search.block_bounds[group.index as usize * search.features + group.feature as usize]);
+    fetch(bounds.map(|bounds| bounds.ceiling[0]));
     for candidate in &search.groups {
         let (group, feature) = (candidate.index as usize, candidate.feature as usize);
         let (row, lane) = (feature / LANES, feature % LANES);
@@ -302,6 +307,9 @@ fn search_best_block(search: &mut Search, kept: &[usize]) {
 /// memory at once.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn search_blocks(search: &mut Search) {
+    fetch(
+        search.blocks.iter().map(|block| search.query.blocks(block.feature as usize)[block.index as usize][BLOCK - 1]),
+    );
     for candidate in &search.blocks {
         let (index, feature) = (candidate.index as usize, candidate.feature as usize);
         let differences = difference(&search.sum[index], &search.query.blocks(feature)[index]);
@@ -311,6 +319,12 @@ fn search_blocks(search: &mut Search) {
         let ceiling = greatest + search.block_removed[group][block] + search.rounding;
         search.block_bounds[group * search.features + feature].ceiling[block] = (ceiling as f32).next_up();
     }
+}
+
+/// Touches values that are about to be used, so that all of them are on their way from memory at once.
+#[inline(always)]
+fn fetch(values: impl Iterator<Item = f32>) {
+    hint::black_box(values.fold(0, |bits, value| bits | value.to_bits()));
 }
 
 /// The greatest of `values`, compared in pairs so that several are compared at once. `N` is a power of two.
