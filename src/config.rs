@@ -224,8 +224,36 @@ impl Fault {
 
 impl From<toml::de::Error> for Fault {
     fn from(error: toml::de::Error) -> Self {
-        Self::new(error.span().map_or(0, |span| span.start), error.message().trim_end().replace('\n', "; "))
+        Self::new(error.span().map_or(0, |span| span.start), in_plain_words(error.message()))
     }
+}
+
+/// Says what a deserializer found and expected in the words of the file, not of this program.
+fn in_plain_words(message: &str) -> String {
+    let message = message.trim_end().replace('\n', "; ");
+    let mismatch = message.strip_prefix("invalid type: ").or_else(|| message.strip_prefix("invalid value: "));
+    let Some((found, expected)) = mismatch.and_then(|mismatch| mismatch.split_once(", expected ")) else {
+        return message;
+    };
+    let found = match found.split_once(' ') {
+        Some(("integer" | "boolean", value)) => value.trim_matches('`').to_owned(),
+        Some(("floating", value)) => value.trim_start_matches("point ").trim_matches('`').to_owned(),
+        Some(("string", value)) => value.to_owned(),
+        _ if found == "map" => "a table".to_owned(),
+        _ if found == "sequence" => "a list".to_owned(),
+        _ => found.to_owned(),
+    };
+    let expected = match expected {
+        "u8" => "a whole number from 0 to 255",
+        "u16" | "u32" | "u64" | "usize" => "a whole number that is not negative",
+        "i8" | "i16" | "i32" | "i64" => "a whole number",
+        "f32" | "f64" => "a number",
+        "a boolean" => "true or false",
+        "a string" => "a text in quotes",
+        "path string" => "a path in quotes",
+        _ => expected,
+    };
+    format!("is {found}, expected {expected}")
 }
 
 /// The tables of a file; each is taken out when it is read.
@@ -300,8 +328,15 @@ impl<'a> Table<'a> {
             fault.what = format!("[{}]: {}", self.name, fault.what);
             fault
         };
-        let settings = T::deserialize(Deserializer::from(Spanned::new(at.clone(), entries)))
-            .map_err(|error| in_table(error.into()))?;
+        let settings = T::deserialize(Deserializer::from(Spanned::new(at.clone(), entries))).map_err(|error| {
+            let mut fault = Fault::from(error);
+            // A value of the wrong type: the key it belongs to is the last one before it.
+            let key = offsets.iter().filter(|(_, offset)| *offset < fault.offset).max_by_key(|(_, offset)| *offset);
+            if let (Some((key, _)), true) = (key, fault.what.starts_with("is ")) {
+                fault.what = format!("{key} {}", fault.what);
+            }
+            in_table(fault)
+        })?;
         check(&settings).map_err(|what| {
             // A complaint starts with the key it is about.
             let key = what.split_whitespace().next().unwrap_or_default().trim_matches('`');
@@ -370,7 +405,7 @@ mod tests {
         assert!(RecordConfig::parse(LEAST).is_ok());
         let table = [
             ("name = \"car\"", "name = \"car\"\nspeed_kmh = 3", "3: [vehicle]: unknown field `speed_kmh`"),
-            ("name = \"car\"", "name = 3", "2: [vehicle]: invalid type: integer `3`, expected a string"),
+            ("name = \"car\"", "name = 3", "2: [vehicle]: name is 3, expected a text in quotes"),
             ("name = \"car\"", "name = \"\"", "2: [vehicle]: name has 0 characters, expected 1 to 64"),
             ("[vehicle]\nname = \"car\"\n", "", "1: the table [vehicle] is missing"),
             (
@@ -386,6 +421,16 @@ mod tests {
             ),
             ("[recorder]", "[sync]\nmax_gap_s = -1.0\n[recorder]", "8: [sync]: max_gap_s is -1"),
             ("[recorder]", "[sync]\nmax_gap_s = nan\n[recorder]", "8: [sync]: max_gap_s is NaN"),
+            (
+                "folder = \"out\"",
+                "folder = \"out\"\nqueue_mib = \"64\"",
+                "9: [recorder]: queue_mib is \"64\", expected a whole number that is not negative",
+            ),
+            (
+                "folder = \"out\"",
+                "folder = \"out\"\nsegment_s = 1.5",
+                "9: [recorder]: segment_s is 1.5, expected a whole number that is not negative",
+            ),
             ("[recorder]", "[gps]\n[recorder]", "7: unknown table or key `gps`, expected [vehicle]"),
             (
                 "folder = \"out\"",

@@ -11,7 +11,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use common::omniloc_path;
+use common::{
+    drive::{PATIENCE, configure, finished, health, messages, start, stderr, wait},
+    omniloc_path,
+};
 use omniloc::{
     recording::{DeviceRecords, Recording, proto::omniloc as messages, topics},
     types::NS_PER_S,
@@ -21,72 +24,6 @@ use rustix::process::{Pid, Signal, kill_process};
 
 /// A drive long enough for a fault in its middle, small enough for a busy computer.
 const DURATION_S: f64 = 14.0;
-/// Longer than any drive here, by far.
-const PATIENCE: Duration = Duration::from_secs(240);
-
-/// Writes a configuration; `faults` are `(kind, at_s, lasts_s)`.
-fn configure(folder: &Path, simulation: &str, faults: &[(&str, f64, f64)]) -> PathBuf {
-    let mut toml = format!(
-        "[vehicle]\nname = \"test car\"\n[camera]\ndriver = \"simulated\"\n[gnss]\ndriver = \"simulated\"\n\
-         [recorder]\nfolder = \"recordings\"\nmin_free_mib = 64\nmin_free_percent = 0.0\n\
-         [simulation]\nplace = \"corridor\"\nwidth_px = 320\nheight_px = 180\nframe_rate_hz = 5.0\n{simulation}\n"
-    );
-    if !simulation.contains("[simulation.receiver]") {
-        toml += "[simulation.receiver]\nrate_hz = 50.0\n";
-    }
-    for (kind, at_s, lasts_s) in faults {
-        toml += &format!("[[simulation.faults]]\nkind = \"{kind}\"\nat_s = {at_s:.1}\nlasts_s = {lasts_s:.1}\n");
-    }
-    let path = folder.join("drive.toml");
-    fs::write(&path, toml).expect("writes");
-    path
-}
-
-fn start(config: &Path) -> Child {
-    let mut command = Command::new(omniloc_path());
-    command.arg("record").arg("--config").arg(config).stdout(Stdio::piped()).stderr(Stdio::piped());
-    command.spawn().expect("starts")
-}
-
-fn wait(child: Child) -> Output {
-    let pid = Pid::from_child(&child);
-    let watchdog = thread::spawn(move || {
-        thread::park_timeout(PATIENCE);
-        pid
-    });
-    let output = child.wait_with_output().expect("ends");
-    watchdog.thread().unpark();
-    output
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
-fn finished(folder: &Path) -> Vec<PathBuf> {
-    let mut paths: Vec<PathBuf> =
-        fs::read_dir(folder.join("recordings")).expect("readable").map(|entry| entry.expect("entry").path()).collect();
-    paths.retain(|path| path.extension().is_some_and(|extension| extension == "mcap"));
-    paths.sort();
-    paths
-}
-
-/// Everything of one topic in a recording.
-fn messages<M: Message + Default>(path: &Path, topic: &topics::Topic) -> Vec<(u64, M)> {
-    let bytes = fs::read(path).expect("readable");
-    let of_topic = mcap::MessageStream::new(&bytes).expect("a recording").map(|message| message.expect("sound"));
-    of_topic
-        .filter(|message| message.channel.topic == topic.name)
-        .map(|message| (message.publish_time, M::decode(&*message.data).expect("decodes")))
-        .collect()
-}
-
-/// Words that `/status` said, from the second after the first frame on.
-fn health(statuses: &[(u64, messages::Status)], word: impl Fn(&messages::Status) -> &str) -> BTreeSet<String> {
-    let started = statuses.iter().filter(|(_, status)| status.frames > 0 && status.serial_bytes > 0);
-    started.map(|(_, status)| word(status).to_owned()).collect()
-}
-
 struct Drive {
     folder: tempfile::TempDir,
     output: Output,

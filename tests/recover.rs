@@ -5,7 +5,12 @@ mod common;
 use std::{fs, path::Path};
 
 use common::{TinyDataset, names, omniloc, run};
-use omniloc::recording::recover::recover_bytes;
+use omniloc::recording::{
+    RecordingWriter,
+    proto::omniloc::SurveyPair,
+    recover::{Recovery, recover_bytes},
+    topics,
+};
 
 /// Exit code and output of `recover --json` on these bytes, called `cut.mcap`.
 fn recover(folder: &Path, bytes: &[u8]) -> (i32, serde_json::Value) {
@@ -78,6 +83,51 @@ fn exit_codes_say_whether_something_was_lost() {
     let (code, report) = recover(folder, b"not a recording");
     assert_eq!((code, report["outcome"].as_str()), (1, Some("failed")));
     assert!(report["error"].as_str().is_some_and(|error| error.contains("nothing to recover")), "{report}");
+}
+
+/// A drive as the recorder writes it, cut off: every topic declared at the start, a chunk a frame. Where chunks end.
+fn cut_drive(frames: u32) -> (Vec<u8>, Vec<usize>) {
+    let file = tempfile::NamedTempFile::new().expect("a temporary file");
+    let length = || file.path().metadata().expect("it is there").len() as usize;
+    let out = file.reopen().expect("opens");
+    let mut recording = RecordingWriter::appending(out, 1_700_000_000_000_000_000).expect("starts");
+    topics::ALL.iter().for_each(|topic| recording.declare(topic).expect("declares"));
+    let mut ends = Vec::new();
+    for frame in 0..frames {
+        let stamp_ns = u64::from(frame + 1) * 100_000_000;
+        recording.write_image(frame, stamp_ns, &common::jpeg(64, 64, frame)).expect("writes");
+        let pair = SurveyPair { valid: true, east_m: f64::from(frame), ..Default::default() };
+        recording.write_pair(frame, stamp_ns, pair).expect("writes");
+        recording.flush().expect("writes");
+        ends.push(length());
+    }
+    recording.abandon();
+    (fs::read(file.path()).expect("readable"), ends)
+}
+
+#[test]
+fn without_its_first_chunk_a_cut_drive_is_readable_still() {
+    const FRAMES: u32 = 20;
+    let (mut bytes, ends) = cut_drive(FRAMES);
+    let whole = recover_bytes(&bytes).expect("writes").0;
+    let counts = |recovery: &Recovery| -> Vec<u64> { recovery.topics.values().map(|topic| topic.messages).collect() };
+    assert_eq!(counts(&whole), [u64::from(FRAMES); 3], "images, pairs, poses: {:?}", whole.topics);
+
+    // The declarations stand in the first chunk, which is then not to be trusted.
+    bytes[ends[0] / 2] ^= 1;
+    let (recovery, out) = recover_bytes(&bytes).expect("writes");
+    assert_eq!(counts(&recovery), [u64::from(FRAMES) - 1; 3]);
+    let messages: Vec<_> =
+        mcap::MessageStream::new(&out).expect("sound").map(|message| message.expect("sound")).collect();
+    for message in messages {
+        let topic = topics::ALL.iter().find(|topic| topic.name == message.channel.topic).expect("one of ours");
+        let schema = message.channel.schema.as_ref().expect("declared again");
+        assert_eq!((schema.name.as_str(), &*schema.data), (topic.schema_name, topic.schema));
+    }
+
+    // Neither the file's beginning nor the chunk's is there.
+    let (recovery, _) = recover_bytes(&bytes[ends[3] - 10..]).expect("writes");
+    assert_eq!(counts(&recovery), [u64::from(FRAMES) - 4; 3]);
 }
 
 #[test]

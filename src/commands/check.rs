@@ -9,7 +9,7 @@ use super::{
     DONE, FAILED,
     evaluate::open_map,
     file_kind::{FileKind, file_kind},
-    options::check_input,
+    options::{check_input, check_no_folder},
     print, printable,
 };
 use crate::recording::{Verdict, verify};
@@ -28,6 +28,7 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_input(&args.file)?;
+    check_no_folder(&args.file)?;
     match file_kind(&args.file).with_context(|| format!("reading {}", args.file.display()))? {
         FileKind::Map => return check_map(args),
         FileKind::Recording => {}

@@ -6,7 +6,7 @@ use clap::ValueEnum;
 
 use super::{
     BadArgument, DONE,
-    options::{OutputKind, check_input, check_not_input, check_output, parse_origin},
+    options::{OutputKind, check_input, check_no_folder, check_not_input, check_output, parse_origin},
     print,
 };
 use crate::{
@@ -51,6 +51,7 @@ pub enum To {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_input(&args.recording)?;
+    check_no_folder(&args.recording)?;
     let (format, kind) = match args.to {
         To::Dataset => (Format::Dataset, OutputKind::Folder),
         To::Csv => (Format::Csv, OutputKind::File),

@@ -10,7 +10,7 @@ use super::{
     evaluate::open_map,
     file_kind::{FileKind, file_kind},
     map_report,
-    options::check_input,
+    options::{check_input, check_no_folder},
     print, printable,
     progress::Progress,
 };
@@ -29,6 +29,7 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_input(&args.file)?;
+    check_no_folder(&args.file)?;
     match file_kind(&args.file).with_context(|| format!("reading {}", args.file.display()))? {
         FileKind::Map => show_map(args)?,
         FileKind::Recording => show_recording(args)?,

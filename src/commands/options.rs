@@ -34,6 +34,34 @@ pub fn check_input(path: &Path) -> Result<(), BadArgument> {
     }
 }
 
+/// Refuses a folder where one file is wanted.
+pub fn check_no_folder(path: &Path) -> Result<(), BadArgument> {
+    match path.is_dir() {
+        true => Err(BadArgument(format!("{}: is a folder; name one file in it", path.display()))),
+        false => Ok(()),
+    }
+}
+
+/// A folder stands for the recordings in it, in the order of their names, as a drive's segments are.
+pub fn with_folders(paths: &[PathBuf]) -> Result<Vec<PathBuf>, BadArgument> {
+    let mut all = Vec::new();
+    for path in paths {
+        if !path.is_dir() {
+            all.push(path.clone());
+            continue;
+        }
+        let entries = fs::read_dir(path).map_err(|error| BadArgument(format!("{}: {error}", path.display())))?;
+        let is_recording = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "mcap");
+        let mut inside: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(is_recording).collect();
+        if inside.is_empty() {
+            return Err(BadArgument(format!("{}: no recording (.mcap) is in this folder", path.display())));
+        }
+        inside.sort();
+        all.append(&mut inside);
+    }
+    Ok(all)
+}
+
 /// What an output must be for `--force` to replace it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OutputKind {

@@ -136,7 +136,7 @@ fn as_text(recording: &Path, outcome: &Outcome) -> String {
     } else {
         let zeros = match recovery.zero_bytes {
             0 => String::new(),
-            zeros => format!(", {zeros} of them zeros that never reached the disk"),
+            zeros => format!(", {zeros} of them zeros: room for data that never reached the disk"),
         };
         lines.push(format!("lost: {} bytes{zeros}", recovery.lost_bytes));
     }

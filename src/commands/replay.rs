@@ -6,7 +6,7 @@ use anyhow::Context;
 
 use super::{
     BadArgument, DONE, journal,
-    options::{OutputKind, check_input, check_not_input, check_output},
+    options::{OutputKind, check_input, check_no_folder, check_not_input, check_output},
     print, record,
 };
 use crate::{
@@ -71,6 +71,7 @@ fn parse_speed(text: &str) -> Result<Speed, String> {
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_input(&args.recording)?;
+    check_no_folder(&args.recording)?;
     check_not_input(&args.out, std::slice::from_ref(&args.recording))?;
     match args.speed {
         Speed::Max => check_output(&args.out, OutputKind::File, args.force)?,

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 
 use super::BadArgument;
-use super::options::{check_input, check_not_input};
+use super::options::{check_input, check_not_input, with_folders};
 use super::progress::Progress;
 use crate::features::Descriptor;
 use crate::map::{PERTURBED_COPIES, Recipe};
@@ -16,12 +16,13 @@ use crate::types::{PositionM, distance_m};
 /// Learning takes time with the third power of the number of frames: more than this many are thinned out.
 const MAX_FRAMES: usize = 800;
 
-/// Opens `paths`, all of which must be usable.
+/// Opens `paths`, all of which must be usable; a folder stands for the recordings in it.
 ///
 /// Of frames closer than `spacing_m` to the one before, only the first is kept. Without it, a drive of more than
 /// [`MAX_FRAMES`] frames is thinned to about that many.
 pub fn open_recordings(paths: &[PathBuf], spacing_m: Option<f64>) -> anyhow::Result<Vec<Recording>> {
-    let mut recordings = open_all(paths)?;
+    let mut recordings = open_all(&with_folders(paths)?)?;
+    refuse_copies(&recordings)?;
     let frames = recordings.iter().map(|recording| recording.survey.len()).sum::<usize>();
     let spacing_m = match spacing_m {
         Some(spacing_m) => spacing_m,
@@ -58,6 +59,21 @@ pub fn in_one_place(mut recordings: Vec<Recording>) -> Result<Vec<Recording>, Ba
         }
     }
     Ok(recordings)
+}
+
+/// A drive that is there twice would count twice.
+fn refuse_copies(recordings: &[Recording]) -> Result<(), BadArgument> {
+    let frames = |recording: &Recording| -> Vec<(u64, PositionM)> {
+        recording.survey.iter().map(|frame| (frame.stamp_ns, frame.position_m)).collect()
+    };
+    for (i, recording) in recordings.iter().enumerate() {
+        let is_copy = |earlier: &&Recording| earlier.name == recording.name && frames(earlier) == frames(recording);
+        if let Some(first) = recordings[..i].iter().find(is_copy) {
+            let (copy, first) = (recording.path.display(), first.path.display());
+            return Err(BadArgument(format!("{copy} holds the same frames as {first}: name it once")));
+        }
+    }
+    Ok(())
 }
 
 fn open_all(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {

@@ -21,7 +21,7 @@ use crate::train::{TrainSettings, train};
 /// default recipe is the one that measures best; `paper` is Do et al. (2015) to the letter.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Recordings of the place, all with the same lens
+    /// Recordings of the place, all with the same lens; a folder stands for all in it
     #[arg(required = true, value_name = "REC.mcap")]
     pub recordings: Vec<PathBuf>,
     /// The map to write

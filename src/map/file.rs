@@ -133,7 +133,8 @@ pub fn from_bytes(bytes: &[u8]) -> Result<FeatureMap, MapError> {
     let mut tensors: BTreeMap<String, TensorView> = file.tensors().into_iter().collect();
     let stated = tensors.remove(CHECKSUM).ok_or_else(|| MapError::Damaged("it has no checksum".into()))?;
     let found = checksum(text, tensors.iter().map(|(name, tensor)| (name.as_str(), tensor.data())));
-    if stated.data() != found {
+    // A fuzzer would never get past it.
+    if !cfg!(fuzzing) && stated.data() != found {
         return Err(MapError::Checksum);
     }
     let info: MapInfo = serde_json::from_value(json).map_err(|error| MapError::Damaged(error.to_string()))?;

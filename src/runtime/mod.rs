@@ -13,6 +13,7 @@
 //! `drive` puts a drive together, `live` runs it, `supervisor` keeps each device running, and `survey` is what becomes
 //! of what they say; `playback` takes a recorded drive through the same survey without any clock.
 
+mod complaints;
 pub mod drive;
 pub mod live;
 pub mod playback;

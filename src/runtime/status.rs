@@ -17,12 +17,17 @@ use crate::{
 /// A camera or receiver that was heard within this time is well.
 const HEARD_NS: u64 = 2 * NS_PER_S;
 
+/// A device that is open and has said nothing for so long is silent rather than starting \[s\].
+const START_S: u32 = 3;
+
 /// One device: what its last failure was, and when it was last heard.
 #[derive(Debug, Default)]
 struct DeviceState {
     failure: Option<&'static str>,
     ended: bool,
     opened: u32,
+    /// Seconds since it was opened for the first time, without a word from it.
+    waited_s: u32,
     last_heard_ns: Option<u64>,
 }
 
@@ -33,6 +38,7 @@ impl DeviceState {
             (_, Some(failure)) => failure,
             (Some(heard_ns), None) if now_ns.saturating_sub(heard_ns) <= HEARD_NS => "ok",
             (Some(_), None) => "silent",
+            (None, None) if self.waited_s > START_S => "silent",
             (None, None) => "waiting",
         }
     }
@@ -41,6 +47,10 @@ impl DeviceState {
     fn open(&mut self) {
         self.opened += 1;
         self.failure = self.failure.filter(|failure| ["silent", "bad data"].contains(failure));
+    }
+
+    fn second(&mut self) {
+        self.waited_s += u32::from(self.opened > 0 && self.last_heard_ns.is_none());
     }
 
     fn heard(&mut self, stamp_ns: u64) {
@@ -62,6 +72,8 @@ pub struct StatusCounter {
     searching: bool,
     /// When bytes came last, whatever they say.
     last_bytes_ns: Option<u64>,
+    /// When something whole came that cannot be believed.
+    last_rejected_ns: Option<u64>,
     last_second_ns: u64,
     newest_ns: u64,
 }
@@ -127,6 +139,10 @@ impl StatusCounter {
         self.searching = true;
     }
 
+    pub fn rejected(&mut self, arrival_ns: u64) {
+        self.last_rejected_ns = Some(arrival_ns);
+    }
+
     pub fn heading(&mut self) {
         self.headings_this_second += 1;
     }
@@ -146,13 +162,11 @@ impl StatusCounter {
     }
 
     fn gnss_health(&self, now_ns: u64) -> &'static str {
+        let is_recent = |last_ns: Option<u64>| last_ns.is_some_and(|last_ns| last_ns + HEARD_NS >= now_ns);
         match self.gnss.health(now_ns) {
             "ok" if self.searching => "no fix",
-            "silent" | "waiting" | "bad data"
-                if self.last_bytes_ns.is_some_and(|last_ns| last_ns + HEARD_NS >= now_ns) =>
-            {
-                "unreadable"
-            }
+            "silent" | "waiting" | "bad data" if is_recent(self.last_rejected_ns) => "implausible",
+            "silent" | "waiting" | "bad data" if is_recent(self.last_bytes_ns) => "unreadable",
             health => health,
         }
     }
@@ -160,6 +174,8 @@ impl StatusCounter {
     /// Closes the second.
     pub fn second(&mut self, tick: &Tick, latency: LatencyEstimate, serial: &DecoderCounters) -> &Status {
         let now_ns = self.now_ns(tick);
+        self.camera.second();
+        self.gnss.second();
         let span_s = now_ns.saturating_sub(self.last_second_ns) as f64 * 1e-9;
         let per_second = |count: &mut u32| if span_s > 0.0 { f64::from(std::mem::take(count)) / span_s } else { 0.0 };
         let SystemStatus { cpu_cores, resident_bytes, temperature_celsius, throttled } = tick.system;

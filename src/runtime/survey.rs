@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 
 use tracing::{info, warn};
 
-use super::{status::StatusCounter, system::SystemStatus};
+use super::{complaints::Complaints, status::StatusCounter, system::SystemStatus};
 use crate::{
     devices::{CameraEvent, CameraFacts, CameraFrame, GpioEvent, Lost, SerialEvent},
     gnss::{DecoderSettings, GnssDecoder},
@@ -78,6 +78,9 @@ pub struct Survey {
     decoder: GnssDecoder,
     synchronizer: Synchronizer,
     status: StatusCounter,
+    complaints: Complaints,
+    /// Sentences and packets with wrong sums that the complaints know of.
+    damaged_told: u64,
     encoder: Encoder,
     /// Number of the next frame if the camera's count starts anew.
     next_frame: u32,
@@ -99,6 +102,8 @@ impl Survey {
             decoder: GnssDecoder::new(decoder),
             synchronizer: Synchronizer::new(sync, None)?,
             status: StatusCounter::default(),
+            complaints: Complaints::default(),
+            damaged_told: 0,
             encoder: Encoder::new(log_offset_ns),
             next_frame: 0,
             frame_shift: None,
@@ -171,6 +176,7 @@ impl Survey {
         self.next_frame = sequence.wrapping_add(1);
         self.status.frame(frame.stamp_ns, frame.damage.is_some());
         if let Some(reason) = frame.damage {
+            self.complaints.note(topics::CAMERA_IMAGE.name, reason, 1);
             out.push(Entry::Lost(Loss::one(&topics::CAMERA_IMAGE, reason, frame.stamp_ns)));
         }
         // A damaged frame is recorded too: whoever looks at it later sees what the camera sent.
@@ -218,6 +224,7 @@ impl Survey {
             }
             GnssSample::NoFix { arrival_ns, .. } => self.status.no_fix(*arrival_ns),
             GnssSample::Rejected { arrival_ns, reason } => {
+                self.status.rejected(*arrival_ns);
                 let lost = Lost { count: 1, reason, stamp_ns: *arrival_ns };
                 self.lost(&topics::GNSS_FIX, &lost, out);
             }
@@ -253,6 +260,7 @@ impl Survey {
 
     fn lost(&mut self, topic: &'static Topic, lost: &Lost, out: &mut dyn Sink) {
         self.status.lost(topic, lost.count);
+        self.complaints.note(topic.name, lost.reason, lost.count);
         let Lost { count, reason, stamp_ns } = *lost;
         out.push(Entry::Lost(Loss { topic, reason, count, first_ns: stamp_ns, last_ns: stamp_ns }));
     }
@@ -288,11 +296,21 @@ impl Survey {
                 self.lost(topic, &Lost { count, reason: "computer too slow", stamp_ns: now_ns }, out);
             }
         }
+        self.complain(now_ns);
         self.poll(now_ns, out);
         let timestamp = self.timestamp(now_ns);
         let status = self.status.second(tick, self.synchronizer.latency(), &self.decoder.counters());
         let status = omniloc::Status { timestamp, ..status.clone() };
         out.push(self.encoder.message(&topics::STATUS, 0, now_ns, &status));
+    }
+
+    fn complain(&mut self, now_ns: u64) {
+        let damaged = self.decoder.counters().framing.refused();
+        self.complaints.note(topics::GNSS_RAW.name, "sum or length wrong", damaged - self.damaged_told);
+        self.damaged_told = damaged;
+        for (topic, reason, count) in self.complaints.due(now_ns) {
+            warn!(topic, reason, count, "lost or refused");
+        }
     }
 
     fn clock(&mut self, clocks: ClockReading, out: &mut dyn Sink) {

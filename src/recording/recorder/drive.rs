@@ -10,10 +10,7 @@
 use std::{
     collections::VecDeque,
     io,
-    sync::{
-        Arc,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::{Arc, atomic::Ordering},
 };
 
 use mcap::McapError;
@@ -21,21 +18,16 @@ use tracing::{info, warn};
 
 use super::{
     Settings,
+    disk::{self, Facts},
     entry::{Entry, Loss},
     guard::{Guard, delete_oldest},
+    open_segment::{LINGER_NS, OpenSegment, PAIR_WAIT_NS},
     queue::Queued,
     segments::{Appender, Head, Part, Segment, SegmentName},
-    storage::{Space, Storage},
+    storage::Storage,
 };
-use crate::{
-    recording::topics,
-    types::{Clock, NS_PER_S},
-};
+use crate::types::{Clock, NS_PER_S};
 
-/// How long a segment that is no longer written to waits for pairs.
-pub const PAIR_WAIT_NS: u64 = 5 * NS_PER_S;
-/// How long it stays open after the last one: the pose follows its pair.
-const LINGER_NS: u64 = NS_PER_S;
 /// Without frames for so long a segment may end anywhere.
 const FRAME_WAIT_NS: u64 = NS_PER_S;
 /// After a second failure in a row the disk is left alone for so long, then twice as long, at most the latter.
@@ -47,16 +39,6 @@ const GUARD_INTERVAL_NS: u64 = NS_PER_S / 2;
 const SLOW_NS: u64 = 2 * NS_PER_S;
 /// A file of this name in the folder asks for the present segment to be marked: `omniloc mark`.
 pub const MARK_REQUEST: &str = "mark.request";
-
-/// State of the disk in a word.
-pub mod disk {
-    pub const OK: &str = "ok";
-    pub const SLOW: &str = "slow";
-    /// No room, and nothing may be deleted.
-    pub const FULL: &str = "full";
-    pub const READ_ONLY: &str = "read-only";
-    pub const FAILED: &str = "failed";
-}
 
 /// Writes one drive.
 pub struct DriveWriter {
@@ -91,36 +73,6 @@ pub struct DriveWriter {
     facts: Facts,
 }
 
-/// What is known about the disk.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Facts {
-    pub space: Space,
-    pub is_full: bool,
-    pub error: Option<&'static str>,
-    pub last_error: Option<String>,
-    pub lost: u64,
-    pub written_bytes: u64,
-    /// Longest operation and when it ended; the one before is forgotten after a second.
-    pub stall_ns: u64,
-    stall_at_ns: u64,
-}
-
-struct OpenSegment {
-    name: SegmentName,
-    segment: Segment<Appender>,
-    position: Arc<AtomicU64>,
-    /// Position that the last sync reached.
-    synced_bytes: u64,
-    started_ns: u64,
-    unsynced: VecDeque<Queued>,
-    first_image: Option<u32>,
-    last_image: Option<u32>,
-    last_image_ns: u64,
-    /// Frames whose pair has not come.
-    awaiting: VecDeque<u32>,
-    close_at_ns: u64,
-}
-
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Which {
     Current,
@@ -144,6 +96,9 @@ impl DriveWriter {
     ) -> io::Result<Self> {
         let numbers = storage.list()?.into_iter().filter_map(|file| Some(SegmentName::parse(&file.name)?.0.number));
         let next_number = numbers.max().map_or(1, |last| last + 1);
+        if let Ok(space) = storage.space() {
+            Guard::new(&settings, space).warn_if_less_than(&settings);
+        }
         Ok(Self {
             storage,
             clock,
@@ -194,9 +149,7 @@ impl DriveWriter {
             self.read_mark_request();
         }
         self.write_marks();
-        if now_ns.saturating_sub(self.facts.stall_at_ns) > NS_PER_S {
-            self.facts.stall_ns = 0;
-        }
+        self.facts.age(now_ns);
     }
 
     /// Marks the segment being written and the one before it: they are not deleted to make room.
@@ -347,18 +300,10 @@ impl DriveWriter {
         let written_bytes = open.position.load(Ordering::Relaxed) - before_bytes;
         self.facts.written_bytes += written_bytes;
         if written_bytes > 0 {
-            self.note_stall(now_ns);
+            self.facts.note_stall(&*self.clock, now_ns);
         }
         if let Err(error) = outcome {
             self.fail(which, error);
-        }
-    }
-
-    fn note_stall(&mut self, since_ns: u64) {
-        let now_ns = self.clock.monotonic_ns();
-        let took_ns = now_ns.saturating_sub(since_ns);
-        if took_ns >= self.facts.stall_ns || now_ns.saturating_sub(self.facts.stall_at_ns) > NS_PER_S {
-            (self.facts.stall_ns, self.facts.stall_at_ns) = (took_ns, now_ns);
         }
     }
 
@@ -379,7 +324,7 @@ impl DriveWriter {
         let written_bytes = open.position.load(Ordering::Relaxed) - before_bytes;
         let synced = if outcome.is_ok() { std::mem::take(&mut open.unsynced) } else { VecDeque::new() };
         self.facts.written_bytes += written_bytes;
-        self.note_stall(since_ns);
+        self.facts.note_stall(&*self.clock, since_ns);
         match outcome {
             Ok(()) => {
                 synced.iter().for_each(|queued| self.release(queued));
@@ -416,7 +361,7 @@ impl DriveWriter {
         self.keep_room();
         let since_ns = self.clock.monotonic_ns();
         let outcome = self.create();
-        self.note_stall(since_ns);
+        self.facts.note_stall(&*self.clock, since_ns);
         let new = match outcome {
             Ok(new) => new,
             Err(error) => {
@@ -453,20 +398,7 @@ impl DriveWriter {
         let segment = outcome.inspect_err(|_| {
             let _ = self.storage.remove(&file_name);
         })?;
-        let synced_bytes = position.load(Ordering::Relaxed);
-        Ok(OpenSegment {
-            name,
-            segment,
-            position,
-            synced_bytes,
-            started_ns,
-            unsynced: VecDeque::new(),
-            first_image: None,
-            last_image: None,
-            last_image_ns: 0,
-            awaiting: VecDeque::new(),
-            close_at_ns: 0,
-        })
+        Ok(OpenSegment::new(name, segment, position, started_ns))
     }
 
     /// Ends the segment that waited for pairs.
@@ -481,7 +413,7 @@ impl DriveWriter {
         let outcome = segment.finish().map_err(io_error).map(drop);
         let outcome = outcome.and_then(|()| self.storage.rename(&open, &finished));
         let outcome = outcome.and_then(|()| self.storage.sync_folder());
-        self.note_stall(since_ns);
+        self.facts.note_stall(&*self.clock, since_ns);
         match outcome {
             Ok(()) => info!(segment = finished, "segment finished"),
             Err(error) => {
@@ -557,11 +489,8 @@ impl DriveWriter {
     }
 
     fn keep_room(&mut self) {
-        let guard = Guard {
-            min_free_bytes: self.settings.min_free_mib << 20,
-            min_free_percent: self.settings.min_free_percent,
-        };
         let Ok(space) = self.storage.space() else { return };
+        let guard = Guard::new(&self.settings, space);
         self.facts.space = space;
         self.facts.is_full = guard.is_low(space) && !self.delete_oldest();
     }
@@ -620,28 +549,6 @@ impl DriveWriter {
 
     fn release(&mut self, queued: &Queued) {
         self.released_bytes += queued.bytes;
-    }
-}
-
-impl OpenSegment {
-    fn note(&mut self, entry: &Entry, now_ns: u64) {
-        match entry {
-            Entry::Image { sequence, .. } => {
-                self.first_image = Some(self.first_image.map_or(*sequence, |first| first.min(*sequence)));
-                self.last_image = self.last_image.max(Some(*sequence));
-                self.last_image_ns = now_ns;
-                self.awaiting.push_back(*sequence);
-            }
-            Entry::Message { topic, sequence, .. } if topic.name == topics::SURVEY_PAIR.name => {
-                if let Some(at) = self.awaiting.iter().position(|frame| frame == sequence) {
-                    self.awaiting.remove(at);
-                    if self.awaiting.is_empty() {
-                        self.close_at_ns = self.close_at_ns.min(now_ns + LINGER_NS);
-                    }
-                }
-            }
-            _ => {}
-        }
     }
 }
 

@@ -2,7 +2,10 @@
 
 use std::{collections::BTreeSet, io};
 
+use tracing::warn;
+
 use super::{
+    Settings,
     segments::{Part, SegmentName},
     storage::{FileFacts, Space, Storage},
 };
@@ -15,6 +18,27 @@ pub(super) struct Guard {
 }
 
 impl Guard {
+    /// What `settings` want on a disk of this size, at most half of it: a guard that can never be content would delete
+    /// one segment after the other.
+    pub fn new(settings: &Settings, space: Space) -> Self {
+        let wanted_bytes = settings.min_free_mib << 20;
+        let half_bytes = match space.total_bytes {
+            0 => u64::MAX, // unknown
+            total_bytes => total_bytes / 2,
+        };
+        Self { min_free_bytes: wanted_bytes.min(half_bytes), min_free_percent: settings.min_free_percent }
+    }
+
+    pub fn warn_if_less_than(&self, settings: &Settings) {
+        if self.min_free_bytes < settings.min_free_mib << 20 {
+            warn!(
+                "min_free_mib = {} is more than half of the disk; {} MiB are kept free",
+                settings.min_free_mib,
+                self.min_free_bytes >> 20
+            );
+        }
+    }
+
     pub fn is_low(&self, space: Space) -> bool {
         space.free_bytes < self.min_free_bytes || space.free_percent() < self.min_free_percent
     }
@@ -55,6 +79,15 @@ mod tests {
         {
             assert_eq!(guard.is_low(Space { free_bytes, total_bytes }), low, "{free_bytes} of {total_bytes}");
         }
+    }
+
+    #[test]
+    fn more_than_half_of_the_disk_is_never_wanted() {
+        let settings = Settings { min_free_mib: 100, min_free_percent: 10.0, ..Settings::new("/data") };
+        let of_disk = |total_mib: u64| {
+            Guard::new(&settings, Space { free_bytes: 0, total_bytes: total_mib << 20 }).min_free_bytes >> 20
+        };
+        assert_eq!([1000, 201, 150, 0].map(of_disk), [100, 100, 75, 100]);
     }
 
     #[test]

@@ -8,10 +8,12 @@
 //! Only the writer thread and the mending thread touch the disk. `drive.rs` does the writer's work without a thread,
 //! `segments.rs` writes one segment, `guard.rs` makes room, `mend.rs` mends what a power cut left behind.
 
+pub mod disk;
 mod drive;
 mod entry;
 mod guard;
 mod mend;
+mod open_segment;
 mod queue;
 mod segments;
 mod storage;
@@ -21,9 +23,10 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-pub use drive::{DriveWriter, MARK_REQUEST, PAIR_WAIT_NS, disk};
+pub use drive::{DriveWriter, MARK_REQUEST};
 pub use entry::{Encoder, Entry, Loss};
 pub use mend::{Mended, cut_segments, mend};
+pub use open_segment::PAIR_WAIT_NS;
 pub use queue::{Queue, Queued};
 pub use segments::{Head, Part, Segment, SegmentName};
 pub use storage::{FileFacts, Folder, ReadSeek, SegmentFile, Space, Storage, request_mark};
@@ -47,7 +50,7 @@ pub struct Settings {
     /// that a power cut may cost.
     #[serde(default = "default_sync_interval_ms")]
     pub sync_interval_ms: u64,
-    /// When less than this is free, the oldest segments that are not marked are deleted.
+    /// When less than this is free, at most half of the disk, the oldest segments that are not marked are deleted.
     #[serde(default = "default_min_free_mib")]
     pub min_free_mib: u64,
     #[serde(default = "default_min_free_percent")]

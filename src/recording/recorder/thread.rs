@@ -287,7 +287,11 @@ fn mend_all(shared: &Shared, storage: &dyn Storage, names: &mpsc::Receiver<Segme
             Ok(Mended::Finished(recovery)) => {
                 info!(segment, messages = recovery.messages, lost_bytes = recovery.lost_bytes, "segment mended");
             }
-            Ok(outcome) => info!(segment, ?outcome, "segment mended"),
+            Ok(Mended::WasWhole) => info!(segment, "segment was whole, only its name was missing"),
+            Ok(Mended::WasEmpty) => info!(segment, "segment had nothing in it and is removed"),
+            Ok(Mended::Unreadable) => {
+                warn!(segment = name.file(super::Part::Damaged), "nothing in a cut segment can be read; it is kept");
+            }
             Err(error) => warn!(segment, %error, "segment could not be mended yet"),
         }
         let mut health = shared.health();

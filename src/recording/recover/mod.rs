@@ -8,8 +8,12 @@
 //!   message and in its frame;
 //! - nothing of a chunk whose CRC does not fit for no visible reason: a wrong position is worse than a missing one.
 //!
-//! `walk.rs` goes through the file and decides, `window.rs` reads it, this file writes and reports.
+//! Schemas and channels stand once, at the start, and again at the end of a complete file. Where both are lost, channels
+//! are taken for those that the recorder declares, if a message is exactly of such a schema.
+//!
+//! `walk.rs` goes through the file, `judge.rs` decides on messages, `window.rs` reads, this file writes and reports.
 
+mod judge;
 mod walk;
 mod window;
 

@@ -9,16 +9,16 @@ use mcap::{
     MAGIC,
     records::{MessageHeader, Record, op},
 };
-use prost::Message;
 
-use super::{LostSpan, Recovery, Sink, StreamError, window::Window};
-use crate::{
-    jpeg,
-    recording::{
-        proto::{foxglove, omniloc},
-        reader::TopicSummary,
-        records::{FRAMING_BYTES, MAX_RECORD_BYTES, parse, visit_chunk},
-    },
+use super::{
+    LostSpan, Recovery, Sink, StreamError,
+    judge::{Trust, is_exactly, is_whole},
+    window::Window,
+};
+use crate::recording::{
+    reader::TopicSummary,
+    records::{FRAMING_BYTES, MAX_RECORD_BYTES, parse, visit_chunk},
+    topics::{self, Topic},
 };
 
 const FRAMING: u64 = FRAMING_BYTES as u64;
@@ -28,17 +28,6 @@ const CHUNK_HEADER_BYTES: u64 = 8 + 8 + 8 + 4 + 4 + 8;
 const MAX_COMPRESSION_NAME_BYTES: u64 = 16;
 /// A larger jump of the sequence numbers is a new count, not a loss.
 const MAX_GAP: u32 = 100_000;
-
-/// How much is known about the bytes at hand.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Trust {
-    /// Found behind damage, by its looks.
-    Damaged,
-    /// Nothing was wrong so far, but no CRC says so.
-    Plain,
-    /// A CRC fits.
-    Proven,
-}
 
 /// What the bytes at an offset are.
 enum Step {
@@ -287,30 +276,12 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
     fn record(&mut self, opcode: u8, body: &[u8], trust: Trust) -> Result<bool, StreamError> {
         let Ok(record) = parse(opcode, body) else { return Ok(false) };
         match record {
-            Record::Schema { header, data } => {
-                let accepted = self.sink.schema(header.id, &header.name, &header.encoding, &data)?;
-                if accepted {
-                    self.schemas.insert(header.id, header.name);
-                }
-                Ok(accepted)
-            }
-            Record::Channel(record) => {
-                let accepted = self.sink.channel(&record)?;
-                if accepted {
-                    let schema_name = self.schemas.get(&record.schema_id).cloned().unwrap_or_default();
-                    self.channels.entry(record.id).or_insert_with(|| Channel {
-                        topic: record.topic,
-                        schema_name,
-                        last_sequence: None,
-                        behind_loss: false,
-                        damaged: 0,
-                    });
-                }
-                Ok(accepted)
-            }
+            Record::Schema { header, data } => self.record_schema(header.id, &header.name, &header.encoding, &data),
+            Record::Channel(record) => self.record_channel(record),
             Record::Message { header, data } => {
+                self.presume_channel(&header, &data)?;
                 let Some(channel) = self.channels.get(&header.channel_id) else { return Ok(false) };
-                if !is_whole(channel, &header, &data, trust) {
+                if !is_whole(&channel.schema_name, &header, &data, trust) {
                     return Ok(false);
                 }
                 self.sink.message(&header, &data)?;
@@ -326,6 +297,52 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
             }
             _ => Ok(true),
         }
+    }
+
+    /// Takes a message whose channel was never declared for one of ours, if it can be no other: the declarations stand
+    /// once, at the start, and may be what was lost.
+    fn presume_channel(&mut self, header: &MessageHeader, data: &[u8]) -> Result<(), StreamError> {
+        let id = header.channel_id;
+        if self.recovery.lost_bytes == 0 || self.channels.contains_key(&id) {
+            return Ok(());
+        }
+        let Some(topic) = presumed_topic(id).filter(|topic| is_exactly(topic.schema_name, header, data)) else {
+            return Ok(());
+        };
+        // Every topic has a schema of its own, so both count alike.
+        let schema_id = id;
+        self.record_schema(schema_id, topic.schema_name, "protobuf", topic.schema)?;
+        self.record_channel(mcap::records::Channel {
+            id,
+            schema_id,
+            topic: topic.name.into(),
+            message_encoding: "protobuf".into(),
+            metadata: BTreeMap::new(),
+        })?;
+        Ok(())
+    }
+
+    fn record_schema(&mut self, id: u16, name: &str, encoding: &str, data: &[u8]) -> Result<bool, StreamError> {
+        let accepted = self.sink.schema(id, name, encoding, data)?;
+        if accepted {
+            self.schemas.insert(id, name.to_owned());
+        }
+        Ok(accepted)
+    }
+
+    fn record_channel(&mut self, record: mcap::records::Channel) -> Result<bool, StreamError> {
+        let accepted = self.sink.channel(&record)?;
+        if accepted {
+            let schema_name = self.schemas.get(&record.schema_id).cloned().unwrap_or_default();
+            self.channels.entry(record.id).or_insert_with(|| Channel {
+                topic: record.topic,
+                schema_name,
+                last_sequence: None,
+                behind_loss: false,
+                damaged: 0,
+            });
+        }
+        Ok(accepted)
     }
 
     fn note_message(&mut self, header: &MessageHeader) {
@@ -443,8 +460,9 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
             return Ok(false);
         }
         let header = self.get(offset + FRAMING, MESSAGE_HEADER_BYTES)?;
-        let known = header.first_chunk::<2>().map(|&id| u16::from_le_bytes(id));
-        if length < MESSAGE_HEADER_BYTES || !known.is_some_and(|id| self.channels.contains_key(&id)) {
+        let id = header.first_chunk::<2>().map(|&id| u16::from_le_bytes(id));
+        let is_channel = |id| self.channels.contains_key(&id) || presumed_topic(id).is_some();
+        if length < MESSAGE_HEADER_BYTES || !id.is_some_and(is_channel) {
             return Ok(false);
         }
         self.budget_bytes = self.budget_bytes.saturating_sub(length);
@@ -453,8 +471,12 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
         }
         let body = self.window.get(offset + FRAMING, length).map_err(StreamError::Read)?;
         let Ok(Record::Message { header, data }) = parse(opcode, body) else { return Ok(false) };
-        let channel = self.channels.get(&header.channel_id).expect("looked up above");
-        Ok(is_whole(channel, &header, &data, Trust::Damaged))
+        Ok(match self.channels.get(&header.channel_id) {
+            Some(channel) => is_whole(&channel.schema_name, &header, &data, Trust::Damaged),
+            None => {
+                presumed_topic(header.channel_id).is_some_and(|topic| is_exactly(topic.schema_name, &header, &data))
+            }
+        })
     }
 
     /// Schemas and channels from the end of the file, in case the chunk that has them at the start is lost.
@@ -499,6 +521,11 @@ struct ChunkHeader {
 /// Channel, sequence number, log time, publish time.
 const MESSAGE_HEADER_BYTES: u64 = 2 + 4 + 8 + 8;
 
+/// The topic that our recorder gives this channel: it declares all of them first, in their order, counting from 1.
+fn presumed_topic(channel_id: u16) -> Option<&'static Topic> {
+    topics::ALL.get(usize::from(channel_id.checked_sub(1)?)).copied()
+}
+
 fn op_is_known(opcode: u8) -> bool {
     (op::HEADER..=op::DATA_END).contains(&opcode) || opcode >= 0x80
 }
@@ -507,40 +534,5 @@ fn op_is_known(opcode: u8) -> bool {
 fn find_candidate(bytes: &[u8]) -> Option<usize> {
     bytes.windows(FRAMING_BYTES).position(|framing| {
         matches!(framing[0], op::CHUNK | op::MESSAGE) && framing[5..] == [0; 4] && framing[1..5] != [0; 4]
-    })
-}
-
-/// Whether a message can be what was written. Nothing can be said of a schema that is not ours.
-fn is_whole(channel: &Channel, header: &MessageHeader, data: &[u8], trust: Trust) -> bool {
-    if trust == Trust::Proven {
-        return true;
-    }
-    let Some(decoded) = decode(&channel.schema_name, data) else { return trust == Trust::Plain };
-    let Ok((timestamp, image_is_whole)) = decoded else { return false };
-    let time_ns = timestamp.map(|time| i128::from(time.seconds) * 1_000_000_000 + i128::from(time.nanos));
-    trust == Trust::Plain || (time_ns == Some(header.log_time.into()) && image_is_whole)
-}
-
-type Decoded = Result<(Option<prost_types::Timestamp>, bool), prost::DecodeError>;
-
-/// A message's own timestamp, and whether the image in it, if there is one, is whole. `None`: not a schema of ours.
-fn decode(schema_name: &str, data: &[u8]) -> Option<Decoded> {
-    macro_rules! timestamp {
-        ($message:ty) => {
-            <$message>::decode(data).map(|message| (message.timestamp, true))
-        };
-    }
-    Some(match schema_name {
-        "foxglove.CompressedImage" => foxglove::CompressedImage::decode(data)
-            .map(|image| (image.timestamp, image.format != "jpeg" || jpeg::scan(&image.data).is_ok())),
-        "foxglove.LocationFix" => timestamp!(foxglove::LocationFix),
-        "foxglove.PoseInFrame" => timestamp!(foxglove::PoseInFrame),
-        "omniloc.SerialChunk" => timestamp!(omniloc::SerialChunk),
-        "omniloc.Heading" => timestamp!(omniloc::Heading),
-        "omniloc.SurveyPair" => timestamp!(omniloc::SurveyPair),
-        "omniloc.ClockOffset" => timestamp!(omniloc::ClockOffset),
-        "omniloc.Status" => timestamp!(omniloc::Status),
-        "omniloc.Dropped" => timestamp!(omniloc::Dropped),
-        _ => return None,
     })
 }

@@ -1,0 +1,113 @@
+//! Drives on a disk that is slow, full or read-only for a while, through the whole program.
+//!
+//! The disk is the machine's; a library that is preloaded into the program makes it fail: `disk_shim/shim.c`.
+
+mod common;
+
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+    sync::OnceLock,
+    thread,
+    time::Duration,
+};
+
+use common::{
+    drive::{command, configure, finished, health, messages, stderr, wait},
+    omniloc,
+};
+use omniloc::recording::{
+    proto::{foxglove, omniloc as proto},
+    topics,
+};
+
+/// Compiles the library once.
+fn shim() -> &'static Path {
+    static SHIM: OnceLock<PathBuf> = OnceLock::new();
+    SHIM.get_or_init(|| {
+        let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join("disk_shim.so");
+        // Another run of this program may be using the library: a new one is put in its place whole.
+        let compiling = library.with_extension(std::process::id().to_string());
+        let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/disk_shim/shim.c");
+        let compiled = Command::new("cc")
+            .args(["-shared", "-fPIC", "-O1", "-Wall", "-Wextra", "-Werror", "-o"])
+            .args([compiling.as_path(), Path::new(source)])
+            .arg("-ldl")
+            .status()
+            .expect("cc runs");
+        assert!(compiled.success());
+        fs::rename(&compiling, &library).expect("renames");
+        library
+    })
+}
+
+/// Bytes in the folder of recordings.
+fn recorded_bytes(folder: &Path) -> u64 {
+    let entries = fs::read_dir(folder.join("recordings")).into_iter().flatten().flatten();
+    entries.filter_map(|entry| Some(entry.metadata().ok()?.len())).sum()
+}
+
+/// Records a drive of `duration_s`; after its first second the disk has the `fault` for `lasts`. What `/status` said of
+/// the disk, and that nothing is missing.
+fn drive_with(fault: &str, lasts: Duration, duration_s: f64) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let faults = folder.path().join("faults");
+    fs::create_dir(&faults).expect("a folder");
+    let config = configure(folder.path(), &format!("duration_s = {duration_s:.1}"), &[]);
+    let recordings = folder.path().join("recordings");
+    let child = command(&config)
+        .env("LD_PRELOAD", shim())
+        .env("DISK_FOLDER", &recordings)
+        .env("DISK_FAULTS", &faults)
+        .spawn()
+        .expect("starts");
+    while recorded_bytes(folder.path()) < 200_000 {
+        thread::sleep(Duration::from_millis(20));
+    }
+    fs::write(faults.join(fault), "").expect("writes");
+    thread::sleep(lasts);
+    fs::remove_file(faults.join(fault)).expect("removes");
+    let output = wait(child);
+    assert!(output.status.success(), "{fault}: {} {}", output.status, stderr(&output));
+
+    // A segment that the end of the drive left cut is mended by the next start, or by hand.
+    for entry in fs::read_dir(&recordings).expect("readable") {
+        let path = entry.expect("entry").path();
+        if path.extension().is_some_and(|extension| extension == "part") {
+            omniloc().arg("recover").arg(path).assert().success();
+        }
+    }
+    let paths = finished(folder.path());
+    let of_all = |topic: &topics::Topic| paths.iter().flat_map(|path| messages::<proto::Status>(path, topic));
+    let statuses: Vec<_> = of_all(&topics::STATUS).collect();
+    let said = health(&statuses, |status| &status.disk_health);
+    assert!(said.contains(fault) && said.contains("ok"), "{fault}: {said:?} {}", stderr(&output));
+    let last = &statuses.iter().max_by_key(|(stamp_ns, _)| stamp_ns).expect("there are some").1;
+    assert_eq!((last.disk_health.as_str(), last.frames_dropped), ("ok", 0), "{fault}");
+
+    // Every frame once, with its pair.
+    let mut frames: BTreeMap<u64, (usize, usize)> = BTreeMap::new();
+    for path in &paths {
+        for (stamp_ns, _) in messages::<foxglove::CompressedImage>(path, &topics::CAMERA_IMAGE) {
+            frames.entry(stamp_ns).or_default().0 += 1;
+        }
+        for (stamp_ns, _) in messages::<proto::SurveyPair>(path, &topics::SURVEY_PAIR) {
+            frames.entry(stamp_ns).or_default().1 += 1;
+        }
+        assert_eq!(messages::<proto::Dropped>(path, &topics::DROPPED).len(), 0, "{fault}");
+        omniloc().arg("check").arg(path).assert().success();
+    }
+    assert!(last.frames > 50 && frames.len() as u64 >= last.frames, "{fault}: {} of {}", frames.len(), last.frames);
+    assert!(frames.values().all(|counts| *counts == (1, 1)), "{fault}: {frames:?}");
+}
+
+#[test]
+fn a_disk_that_is_slow_full_or_read_only_for_a_while_costs_nothing_and_is_reported() {
+    thread::scope(|scope| {
+        scope.spawn(|| drive_with("slow", Duration::from_secs(7), 16.0));
+        scope.spawn(|| drive_with("full", Duration::from_secs(4), 14.0));
+        scope.spawn(|| drive_with("read-only", Duration::from_secs(4), 14.0));
+    });
+}
