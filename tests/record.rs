@@ -3,7 +3,7 @@
 mod common;
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
     process::{Child, Command, Output, Stdio},
@@ -19,7 +19,6 @@ use omniloc::{
     recording::{DeviceRecords, Recording, proto::omniloc as messages, topics},
     types::NS_PER_S,
 };
-use prost::Message;
 use rustix::process::{Pid, Signal, kill_process};
 
 /// A drive long enough for a fault in its middle, small enough for a busy computer.

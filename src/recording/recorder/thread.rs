@@ -1,6 +1,7 @@
 //! The recorder's threads and what others hold of them.
 
 use std::{
+    collections::VecDeque,
     io,
     path::PathBuf,
     sync::{
@@ -9,14 +10,14 @@ use std::{
         mpsc,
     },
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use prost::Message;
 use tracing::{info, warn};
 
 use super::{
-    DriveWriter, Encoder, Entry, Head, Queue, Queued, SegmentName, Settings, Space, Storage, cut_segments,
+    DriveWriter, Encoder, Entry, Head, Part, Queue, Queued, SegmentName, Settings, Space, Storage, cut_segments,
     mend::{Mended, mend},
 };
 use crate::{
@@ -31,6 +32,8 @@ const BATCH: usize = 16;
 /// Mending pauses while the queue is fuller than this part of its capacity, and after each MiB: recording goes first.
 const BUSY_SHARE: usize = 4;
 const MEND_PAUSE: Duration = Duration::from_millis(20);
+/// After a failure the disk is left alone for so long.
+const MEND_RETRY: Duration = Duration::from_secs(2);
 
 /// The recorder of one drive.
 pub struct Recorder {
@@ -220,7 +223,7 @@ impl Shared {
         health.written_bytes = facts.written_bytes;
         health.segment.clear();
         if let Some(name) = drive.segment_name() {
-            health.segment.push_str(&name.file(super::Part::Finished));
+            health.segment.push_str(&name.file(Part::Finished));
         }
         health.lost = facts.lost;
         health.disk = drive.disk();
@@ -271,9 +274,17 @@ fn record(shared: &Shared, mut drive: DriveWriter, to_mender: &mpsc::Sender<Segm
 fn mend_all(shared: &Shared, storage: &dyn Storage, names: &mpsc::Receiver<SegmentName>) {
     // On Linux this is the priority of the thread. Without it mending only costs more.
     let _ = rustix::process::nice(19);
-    while let Ok(name) = names.recv() {
+    let is_over = || shared.stop.load(Ordering::SeqCst);
+    let mut waiting = VecDeque::new();
+    while !is_over() {
+        if waiting.is_empty() {
+            let Ok(name) = names.recv() else { return };
+            waiting.push_back(name);
+        }
+        waiting.extend(names.try_iter());
+        let Some(name) = waiting.pop_front() else { continue };
         let mut pause = || loop {
-            if shared.stop.load(Ordering::SeqCst) {
+            if is_over() {
                 return Err(io::Error::other("the drive is over; the next start goes on"));
             }
             thread::sleep(MEND_PAUSE);
@@ -281,21 +292,35 @@ fn mend_all(shared: &Shared, storage: &dyn Storage, names: &mpsc::Receiver<Segme
                 return Ok(());
             }
         };
-        let outcome = mend(storage, &name, &mut pause);
-        let segment = name.file(super::Part::Finished);
-        match &outcome {
-            Ok(Mended::Finished(recovery)) => {
-                info!(segment, messages = recovery.messages, lost_bytes = recovery.lost_bytes, "segment mended");
+        match mend(storage, &name, &mut pause) {
+            Ok(outcome) => {
+                tell_mended(&name, &outcome);
+                let mut health = shared.health();
+                health.to_mend -= 1;
+                health.mended += 1;
             }
-            Ok(Mended::WasWhole) => info!(segment, "segment was whole, only its name was missing"),
-            Ok(Mended::WasEmpty) => info!(segment, "segment had nothing in it and is removed"),
-            Ok(Mended::Unreadable) => {
-                warn!(segment = name.file(super::Part::Damaged), "nothing in a cut segment can be read; it is kept");
+            Err(error) => {
+                warn!(segment = name.file(Part::Finished), %error, "segment could not be mended yet");
+                waiting.push_back(name);
+                let retry = Instant::now() + MEND_RETRY;
+                while !is_over() && Instant::now() < retry {
+                    thread::sleep(MEND_PAUSE);
+                }
             }
-            Err(error) => warn!(segment, %error, "segment could not be mended yet"),
         }
-        let mut health = shared.health();
-        health.to_mend -= 1;
-        health.mended += u64::from(outcome.is_ok());
+    }
+}
+
+fn tell_mended(name: &SegmentName, outcome: &Mended) {
+    let segment = name.file(Part::Finished);
+    match outcome {
+        Mended::Finished(recovery) => {
+            info!(segment, messages = recovery.messages, lost_bytes = recovery.lost_bytes, "segment mended");
+        }
+        Mended::WasWhole => info!(segment, "segment was whole, only its name was missing"),
+        Mended::WasEmpty => info!(segment, "segment had nothing in it and is removed"),
+        Mended::Unreadable => {
+            warn!(segment = name.file(Part::Damaged), "nothing in a cut segment can be read; it is kept");
+        }
     }
 }
