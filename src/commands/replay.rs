@@ -21,6 +21,7 @@ use crate::{
         playback,
         survey::{Sink, Survey},
     },
+    sync::CameraTurns,
 };
 
 /// Feed a recording to the tasks that made it, as if the devices said everything again
@@ -118,6 +119,7 @@ fn as_fast_as_it_goes(args: &Args, recording: &Recording, config: &RecordConfig)
     let head = replay_head(recording, config)?;
     let log_offset_ns = head.log_offset_ns;
     let clocks_recorded = recording.topics.contains_key(topics::CLOCK.name);
+    let turns = recording.calibration().ok().map(CameraTurns::new);
     let mut survey = Survey::new(&config.decoder, &config.sync, log_offset_ns).map_err(anyhow::Error::msg)?;
     let mut entries = 0;
     write_file_atomically(&args.out, |file| {
@@ -126,7 +128,7 @@ fn as_fast_as_it_goes(args: &Args, recording: &Recording, config: &RecordConfig)
         let segment = Segment::start(file, &head, first_ns).map_err(failed)?;
         let mut out = ToFile { segment, entries: 0, error: None };
         let records = DeviceRecords::open(&args.recording)?;
-        playback::play(records, &mut survey, clocks_recorded, log_offset_ns, &mut out)?;
+        playback::play(records, &mut survey, turns, clocks_recorded, log_offset_ns, &mut out)?;
         if let Some(error) = out.error {
             return Err(failed(error).into());
         }

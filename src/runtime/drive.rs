@@ -64,6 +64,8 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
 
     let boot_id = boot_id();
     let mut head = Head::new(&config.resolved(), &config.vehicle.name, &boot_id, clock.read());
+    // Of a recording that is replayed: it may be any attachment.
+    let donut = calibration.as_deref().and_then(|json| serde_json::from_slice(json).ok());
     head.calibration_json = calibration;
     let start_s = clock.read().monotonic_ns / NS_PER_S;
     let name = format!("{}, {} at {start_s} s", config.vehicle.name, boot_id.get(..8).unwrap_or_default());
@@ -99,6 +101,7 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
         log_offset_ns,
         second: Duration::from_secs_f64(1.0 / speed),
         folder: config.recorder.folder.clone(),
+        calibration: donut.filter(|donut: &DonutCalibration| donut.check().is_ok()),
         led,
     };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("starting the runtime")?;

@@ -23,6 +23,7 @@ use super::{
     supervisor::{Outcome, supervise},
     survey::{Device, Input, Sink, Survey, Tick},
     system::SystemMonitor,
+    turn_watch::TurnWatch,
 };
 use crate::{
     devices::{
@@ -35,7 +36,7 @@ use crate::{
         recorder::{Entry, Recorder, RecorderHandle, RecorderReport, disk},
     },
     sync,
-    types::Clock,
+    types::{Clock, DonutCalibration},
 };
 
 /// Everything has ended at the latest this long after the signal; systemd waits longer by default.
@@ -66,6 +67,8 @@ pub struct DriveSettings {
     /// A second of the clock: shorter on the computer's own clock when a simulation runs faster.
     pub second: Duration,
     pub folder: PathBuf,
+    /// With it the latency of the serial line shows when the vehicle turns.
+    pub calibration: Option<DonutCalibration>,
     /// Shows how the drive is.
     pub led: Led,
 }
@@ -154,6 +157,7 @@ pub async fn run(
         }
     }
 
+    let mut watch = settings.calibration.map(|calibration| watch_turns(calibration, &event_inlet)).transpose()?;
     let handle = recorder.handle();
     let mut out = ToRecorder(&handle);
     let survey = Survey::new(&settings.decoder, &settings.sync, settings.log_offset_ns);
@@ -163,7 +167,12 @@ pub async fn run(
     seconds.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         select! {
-            Some(input) = frames.recv() => survey.take(input, &mut out),
+            Some(input) = frames.recv() => {
+                if let (Input::Camera(CameraEvent::Frame(frame)), Some(watch)) = (&input, &mut watch) {
+                    watch.offer(frame.stamp_ns, &frame.jpeg);
+                }
+                survey.take(input, &mut out);
+            }
             Some(input) = events.recv() => survey.take(input, &mut out),
             _ = seconds.tick() => {
                 let clocks = clock.read();
@@ -210,6 +219,11 @@ pub async fn run(
         folder: settings.folder,
         has_camera: devices_there.0,
     })
+}
+
+fn watch_turns(calibration: DonutCalibration, events: &Inlet) -> anyhow::Result<TurnWatch> {
+    let inlet = events.clone();
+    TurnWatch::start(calibration, move |turn| inlet.emit(Input::Turn(turn))).context("starting the thread turns")
 }
 
 /// What the lamp shows: a fault of the disk before devices that are waited for.

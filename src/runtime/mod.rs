@@ -21,3 +21,4 @@ mod status;
 mod supervisor;
 pub mod survey;
 mod system;
+mod turn_watch;

@@ -22,7 +22,7 @@ use crate::{
         recorder::{Encoder, Entry, Loss, RecorderHealth},
         topics::{self, Topic, metadata},
     },
-    sync::{self, Pair, Synchronizer},
+    sync::{self, Pair, Synchronizer, VisualRotation},
     types::{ClockReading, Fix, Geodetic, GnssSample, Heading},
 };
 
@@ -38,6 +38,8 @@ pub enum Input {
     Camera(CameraEvent),
     Serial(SerialEvent),
     Gpio(GpioEvent),
+    /// The pictures show that the vehicle has turned.
+    Turn(VisualRotation),
     /// A device failed; the word says why. `None`: it ended.
     Health {
         device: Device,
@@ -142,6 +144,9 @@ impl Survey {
             Input::Gpio(GpioEvent::Button { .. }) => {
                 info!("button pressed: this piece of the recording is kept");
                 out.mark();
+            }
+            Input::Turn(VisualRotation { from_ns, to_ns, rotation_rad, .. }) => {
+                self.synchronizer.push_visual_rotation(from_ns, to_ns, rotation_rad);
             }
             Input::Health { device, health } => self.status.device(device, health),
             Input::Tick(tick) => self.tick(&tick, out),

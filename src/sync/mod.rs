@@ -23,6 +23,7 @@
 //! [`Synchronizer`] puts this together without a clock, a thread or a file: what it is told in which order decides what
 //! it says, so that a replay says the same. Only [`latency_from_recording`] reads a file.
 
+mod camera_turns;
 mod clock_map;
 mod interpolate;
 mod latency;
@@ -39,11 +40,12 @@ mod yaw_lag;
 
 use serde::{Deserialize, Serialize};
 
+pub use camera_turns::CameraTurns;
 pub use latency::{LatencyEstimate, LatencySource};
 pub use pair::{InvalidReason, Pair};
 pub use recorded::{RecordedLag, latency_from_recording};
 pub use synchronizer::{Statistics, Synchronizer};
-pub use visual_rotation::{RotationTracker, VisualRotation};
+pub use visual_rotation::VisualRotation;
 
 /// How frames are paired with positions: the table `[sync]`.
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]

@@ -5,12 +5,10 @@ use std::path::Path;
 use prost::Message;
 
 use super::{
-    visual_rotation::RotationTracker,
+    camera_turns::CameraTurns,
     yaw_lag::{LagEstimate, MAX_LAG_S, PIECE_S, Piece, YawLag, YawPoint},
 };
 use crate::{
-    jpeg::LumaDecoder,
-    panorama::{Panorama, UnwrapTable},
     recording::{Recording, RecordingError, proto::omniloc, topics},
     types::DonutCalibration,
 };
@@ -23,10 +21,6 @@ const MAX_HEADING_HZ: f64 = 50.0;
 const PIECES: usize = 8;
 /// Frames looked at: one in so many seconds, every second one of 30 a second.
 const FRAME_INTERVAL_S: f64 = 0.06;
-/// So many turns show by their spread how well each is seen. For fewer it is assumed: what is left of parallax shifts a
-/// right-angled turn between houses by this much.
-const SPREADING_TURNS: usize = 3;
-const TURN_STD_S: f64 = 0.05;
 
 /// By how much pairs and pictures disagree.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -50,7 +44,6 @@ pub fn latency_from_recording(
     mut on_frame: impl FnMut(usize, usize),
 ) -> Result<Option<RecordedLag>, RecordingError> {
     let Ok(calibration) = recording.calibration() else { return Ok(None) };
-    let Some(image_size_px) = recording.image_size_px else { return Ok(None) };
     if !has_enough_headings(recording) {
         return Ok(None);
     }
@@ -58,7 +51,7 @@ pub fn latency_from_recording(
     let starts_s = starts_of_turns(&headings);
     let Some(&last_start_s) = starts_s.last() else { return Ok(None) };
 
-    let mut camera = CameraYaw::new(&calibration, image_size_px, starts_s);
+    let mut camera = CameraYaw::new(calibration, starts_s);
     let of = (camera.starts_s.len() as f64 * PIECE_S / FRAME_INTERVAL_S) as usize;
     Recording::for_each_image(&recording.path, |_, stamp_ns, jpeg| {
         let stamp_s = stamp_ns as f64 * 1e-9;
@@ -78,11 +71,7 @@ pub fn latency_from_recording(
             lag.push(piece);
         }
     }
-    let found = |LagEstimate { lag_s, std_s, turns }| {
-        let unseen_s = if turns < SPREADING_TURNS { TURN_STD_S / (turns as f64).sqrt() } else { 0.0 };
-        RecordedLag { late_s: lag_s, std_s: std_s.hypot(unseen_s), turns }
-    };
-    Ok(lag.estimate().map(found))
+    Ok(lag.estimate().map(|LagEstimate { lag_s, std_s, turns }| RecordedLag { late_s: lag_s, std_s, turns }))
 }
 
 fn has_enough_headings(recording: &Recording) -> bool {
@@ -137,10 +126,7 @@ fn starts_of_turns(headings: &[YawPoint]) -> Vec<f64> {
 /// The camera's yaw in the pieces that are asked for.
 struct CameraYaw {
     starts_s: Vec<f64>,
-    decoder: LumaDecoder,
-    table: Option<UnwrapTable>,
-    panorama: Panorama,
-    tracker: RotationTracker,
+    turns: CameraTurns,
     /// One record a piece.
     pieces: Vec<Vec<YawPoint>>,
     frames: usize,
@@ -150,14 +136,11 @@ struct CameraYaw {
 }
 
 impl CameraYaw {
-    fn new(calibration: &DonutCalibration, (width_px, height_px): (usize, usize), starts_s: Vec<f64>) -> Self {
+    fn new(calibration: DonutCalibration, starts_s: Vec<f64>) -> Self {
         Self {
             pieces: vec![Vec::new(); starts_s.len()],
             starts_s,
-            decoder: LumaDecoder::new(),
-            table: UnwrapTable::build(calibration, width_px, height_px).ok(),
-            panorama: Panorama::zeros(),
-            tracker: RotationTracker::new(calibration.azimuth),
+            turns: CameraTurns::new(calibration),
             frames: 0,
             last_s: f64::NEG_INFINITY,
             last_ns: 0,
@@ -177,17 +160,12 @@ impl CameraYaw {
     fn push(&mut self, stamp_ns: u64, jpeg: &[u8]) {
         let stamp_s = stamp_ns as f64 * 1e-9;
         self.frames += 1;
-        let (Some(index), Some(table)) = (self.piece_at(stamp_s), &self.table) else { return };
-        let Ok(image) = self.decoder.decode(jpeg) else { return };
-        if (image.width_px, image.height_px) != table.image_size_px() {
-            return;
-        }
-        table.unwrap_into(image, 0, &mut self.panorama);
+        let Some(index) = self.piece_at(stamp_s) else { return };
         self.last_s = stamp_s;
         if self.pieces[index].is_empty() {
-            self.tracker.restart();
+            self.turns.restart();
         }
-        let rotation = self.tracker.push(stamp_ns, &self.panorama);
+        let rotation = self.turns.push(stamp_ns, jpeg);
         let piece = &mut self.pieces[index];
         match (piece.last(), rotation) {
             (None, _) => piece.push((stamp_s, 0.0)),

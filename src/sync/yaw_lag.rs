@@ -31,6 +31,10 @@ const RESIDUAL_FACTOR: f64 = 2.5;
 const MIN_STD_S: f64 = 0.001;
 /// A lag with a larger deviation is not worth more than none.
 const MAX_STD_S: f64 = 0.06;
+/// So many turns show by their spread how well each is seen. For fewer it is assumed: what is left of parallax shifts a
+/// right-angled turn between houses by this much.
+const SPREADING_TURNS: usize = 3;
+const TURN_STD_S: f64 = 0.05;
 
 /// Yaw at an instant \[s, rad\].
 pub type YawPoint = (f64, f64);
@@ -126,7 +130,9 @@ impl YawLag {
             return None;
         }
         let std_s = all.std_s().max(spread_s(&pieces, &all)).max(MIN_STD_S);
-        (std_s <= MAX_STD_S).then_some(LagEstimate { lag_s: all.lag_s, std_s, turns: pieces.len() })
+        let turns = pieces.len();
+        let unseen_s = if turns < SPREADING_TURNS { TURN_STD_S / (turns as f64).sqrt() } else { 0.0 };
+        (std_s <= MAX_STD_S).then_some(LagEstimate { lag_s: all.lag_s, std_s: std_s.hypot(unseen_s), turns })
     }
 }
 
@@ -287,7 +293,8 @@ mod tests {
             for (pieces, gain) in [(1, 1.0), (6, 0.9), (6, 1.2)] {
                 let found = lag(pieces, delay_s, gain).expect("turns enough");
                 assert!((found.lag_s - delay_s).abs() < 1e-3, "{found:?}, truth {delay_s}");
-                assert!(found.std_s < 0.005 && found.turns == pieces);
+                let unseen_s = if pieces < SPREADING_TURNS { TURN_STD_S } else { 0.0 };
+                assert!(found.std_s < 0.005 + unseen_s && found.turns == pieces);
             }
         }
     }
