@@ -1,11 +1,6 @@
-//! Configuration files: refused with a place, or sound; what is sound can be written down.
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
-use omniloc::config::RecordConfig;
+#[path = "../bodies.rs"]
+mod bodies;
 
-fuzz_target!(|text: &str| {
-    if let Ok(config) = RecordConfig::parse(text) {
-        let _ = config.resolved();
-    }
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| bodies::config(bytes));
