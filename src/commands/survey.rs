@@ -11,7 +11,7 @@ use crate::features::Descriptor;
 use crate::map::{PERTURBED_COPIES, Recipe};
 use crate::recording::Recording;
 use crate::train::{Survey, SurveyOptions, TrialError};
-use crate::types::{PositionM, distance_m};
+use crate::types::{NS_PER_S, PositionM, distance_m};
 
 /// Learning takes time with the third power of the number of frames: more than this many are thinned out.
 const MAX_FRAMES: usize = 800;
@@ -59,6 +59,21 @@ pub fn in_one_place(mut recordings: Vec<Recording>) -> Result<Vec<Recording>, Ba
     }
     Ok(recordings)
 }
+
+/// How many times the recordings saw their place: those that began within [`ONE_APPEARANCE_S`] of another are one with it.
+/// A recording that does not know the date counts by itself.
+pub fn appearances(recordings: &[Recording]) -> usize {
+    // Log times before this count from when the computer was switched on: 2001-09-09.
+    const FIRST_DATE_NS: u64 = 1_000_000_000 * NS_PER_S;
+    let began_ns = |recording: &Recording| recording.topics.values().map(|summary| summary.first_ns).min();
+    let mut dates_ns: Vec<u64> = recordings.iter().filter_map(began_ns).filter(|&ns| ns > FIRST_DATE_NS).collect();
+    dates_ns.sort_unstable();
+    let repeated = dates_ns.windows(2).filter(|pair| pair[1] - pair[0] < ONE_APPEARANCE_S * NS_PER_S).count();
+    recordings.len() - repeated
+}
+
+/// The light changes, and traffic and parked cars are others \[s\].
+const ONE_APPEARANCE_S: u64 = 3 * 3600;
 
 fn open_all(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
     for (i, path) in paths.iter().enumerate() {
