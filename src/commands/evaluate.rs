@@ -313,7 +313,6 @@ fn trial_entries(
         && case.split_name == args.split[0]
         && case.seed.is_none_or(|seed| seed == args.seed);
     let know_nothing_m = component_median(&pick(&case.split.learning, &recorded_m));
-    let tracks = TrackSmoother::new(survey, &recorded_m);
     let mut entries = Vec::new();
     for (recipe, similarity) in recipes.iter().zip(similarities) {
         let variant = match case.variant {
@@ -332,7 +331,7 @@ fn trial_entries(
                     learned.extend(&case.split.validation);
                     learned.sort_unstable();
                 }
-                tracks.smoothed(&learned, similarity.as_ref()).positions_m
+                TrackSmoother::new(survey, &recorded_m).smoothed(&learned, similarity.as_ref()).positions_m
             }
         };
         let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &learned_m };
