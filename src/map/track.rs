@@ -5,11 +5,10 @@ use serde::{Deserialize, Serialize};
 use super::RecipeName;
 
 /// Whether learning positions are corrected before learning.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Smoothing {
     /// They are taken as the receiver gave them.
-    #[default]
     None,
     /// By how the vehicle moved and by places seen more than once, where a recording is a track.
     Track,

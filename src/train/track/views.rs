@@ -39,6 +39,9 @@ impl Similarity {
         let svd = Svd::new_thin(centered.as_ref()).ok()?;
         let singular: Vec<f64> = svd.S().column_vector().iter().copied().collect();
         let rank = singular.iter().take_while(|&&s| s > NULL_SINGULAR_RATIO * singular[0]).count();
+        if rank == 0 {
+            return None;
+        }
         let projected = changes * svd.V().subcols(0, rank);
         let mut noise = projected.transpose() * &projected * (1.0 / changes.nrows() as f64);
         let ridge = RIDGE * (0..rank).map(|r| noise[(r, r)]).sum::<f64>() / rank as f64;
