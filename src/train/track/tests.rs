@@ -118,7 +118,7 @@ fn motion_takes_off_part_of_the_error_and_views_most_of_it() {
 }
 
 #[test]
-fn two_recordings_agree_afterwards_and_on_the_mean_of_their_receivers() {
+fn two_recordings_agree_afterwards_between_what_their_receivers_said() {
     let truth = laps(150);
     let truth_m: Vec<PositionM> = truth.iter().map(|(position_m, _)| *position_m).collect();
     let mut points = received(&truth, 1, 0.0);
@@ -135,8 +135,11 @@ fn two_recordings_agree_afterwards_and_on_the_mean_of_their_receivers() {
     let apart = |positions_m: &[PositionM]| rmse_m(&positions_m[..150], &positions_m[150..]);
     let (before_m, after_m) = (apart(&positions(&points)), apart(&smoothed.positions_m));
     assert!(after_m < 0.5 * before_m, "{after_m} of {before_m}");
-    let mean = |positions_m: &[PositionM]| positions_m.iter().map(|p| p[0]).sum::<f64>() / 300.0;
-    assert!((mean(&smoothed.positions_m) - mean(&positions(&points))).abs() < 0.3);
+    // Where they agree lies between what they said; where between depends on how steady each receiver looks.
+    let mean_m = |positions_m: &[PositionM]| positions_m.iter().map(|p| p[0]).sum::<f64>() / positions_m.len() as f64;
+    let (received, agreed_m) = (positions(&points), mean_m(&smoothed.positions_m));
+    let (one_m, other_m) = (mean_m(&received[..150]), mean_m(&received[150..]));
+    assert!((one_m..other_m).contains(&agreed_m), "{one_m} {agreed_m} {other_m}");
 }
 
 #[test]
