@@ -44,6 +44,8 @@ fn a_map_is_trained_shown_checked_and_measured_against() {
         run(omniloc().arg("train").arg(&recording).arg("--out").arg(&map).args(["--grid-step-m", "5"]));
     assert_eq!(code, 0, "{stderr}");
     assert!(stdout.contains("trained on     courtyard, 24 frames") && stdout.contains("validation"), "{stdout}");
+    assert!(stdout.contains("positions      as recorded: too few frames"), "{stdout}");
+    assert!(stderr.contains("warning: the map has seen its place only once"), "{stderr}");
 
     let (code, stdout, _) = run(omniloc().arg("info").arg("--json").arg(&map));
     let info: serde_json::Value = serde_json::from_str(&stdout).expect("JSON");

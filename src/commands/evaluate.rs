@@ -15,10 +15,10 @@ use super::survey::{
 use super::{BadArgument, DONE, print};
 use crate::evaluate::{Entry, LEGEND, against_map, table};
 use crate::features::Descriptor;
-use crate::map::{FeatureMap, Recipe, RecipeName, Selection, SplitKind, file};
+use crate::map::{FeatureMap, Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
 use crate::metrics::{ErrorFigures, component_median};
 use crate::recording::{Recording, write_bytes_atomically};
-use crate::train::{Outcome, Split, Survey, Trial, noisy, run as run_trial};
+use crate::train::{Outcome, Similarity, Split, Survey, TrackSmoother, Trial, noisy, run as run_trial};
 use crate::types::PositionM;
 
 /// Measure how well the method localizes on recordings
@@ -36,7 +36,7 @@ pub struct Args {
     #[arg(
         long,
         value_name = "AREA.map",
-        conflicts_with_all = ["recipe", "features", "select", "split", "seed", "seeds", "variants", "grid_step_m"]
+        conflicts_with_all = ["recipe", "features", "select", "split", "seed", "seeds", "variants", "grid_step_m", "smooth"]
     )]
     pub map: Option<PathBuf>,
     /// Recipes to compare, separated by commas [default: paper,default]
@@ -72,6 +72,11 @@ pub struct Args {
         hide_possible_values = true
     )]
     pub variants: Vec<Variant>,
+    /// Correct the positions that are learned from, by how the vehicle moved and by places seen more than once; errors
+    /// are measured against the positions as they were recorded, or against --truth [default: track for the default
+    /// recipe, none for the paper's]
+    #[arg(long, value_enum)]
+    pub smooth: Option<Smoothing>,
     /// Distance of neighbouring candidate cells [m; default: 1 outdoors, 0.1 where the positions lie within 20 m]
     #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub grid_step_m: Option<f64>,
@@ -225,6 +230,11 @@ fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::
         eprintln!("note: {}: not every frame has a yaw; there are no (fixed) rows", recording.name);
     }
     let truth_m = truth(args, &plain)?;
+    let similarity = |recipe: &Recipe| match smoothing(args, recipe) {
+        Smoothing::None => None,
+        Smoothing::Track => Similarity::of(&plain, recipe),
+    };
+    let similarities: Vec<Option<Similarity>> = recipes.iter().map(similarity).collect();
     let mut entries = Vec::new();
     for case in cases(args, &plain)? {
         let survey = match (case.variant, &fixed) {
@@ -232,7 +242,7 @@ fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::
             (Variant::Fixed, None) => continue,
             _ => &plain,
         };
-        entries.extend(trial_entries(args, recording, survey, &recipes, &truth_m, &case, progress)?);
+        entries.extend(trial_entries(args, recording, survey, (&recipes, &similarities), &truth_m, &case, progress)?);
     }
     Ok(entries)
 }
@@ -270,7 +280,7 @@ fn trial_entries(
     args: &Args,
     recording: &Recording,
     survey: &Survey,
-    recipes: &[Recipe],
+    (recipes, similarities): (&[Recipe], &[Option<Similarity>]),
     truth_m: &[PositionM],
     case: &Case,
     progress: &Progress,
@@ -304,7 +314,7 @@ fn trial_entries(
         && case.seed.is_none_or(|seed| seed == args.seed);
     let know_nothing_m = component_median(&pick(&case.split.learning, &recorded_m));
     let mut entries = Vec::new();
-    for recipe in recipes {
+    for (recipe, similarity) in recipes.iter().zip(similarities) {
         let variant = match case.variant {
             Variant::Plain => "",
             Variant::Noisy => " (noisy)",
@@ -312,7 +322,19 @@ fn trial_entries(
         };
         let seed = case.seed.map(|seed| format!(", seed {seed}")).unwrap_or_default();
         let part = format!("{}, {}{variant}{seed}", recipe.name.name(), case.split_name);
-        let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &recorded_m };
+        let learned_m = match smoothing(args, recipe) {
+            Smoothing::None => recorded_m.clone(),
+            Smoothing::Track => {
+                // The images of frames that are never learned from have no part in it.
+                let mut learned = case.split.learning.clone();
+                if recipe.refit {
+                    learned.extend(&case.split.validation);
+                    learned.sort_unstable();
+                }
+                TrackSmoother::new(survey, &recorded_m).smoothed(&learned, similarity.as_ref()).positions_m
+            }
+        };
+        let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &learned_m };
         let outcomes = run_trial(survey, &trial, |step| progress.step(&part, step)).map_err(bad_argument)?;
         for outcome in &outcomes.rows {
             for (warning, count) in outcome.warnings.iter().filter(|_| announced) {
@@ -375,6 +397,10 @@ fn median_entry(base: Entry, learning_m: &[PositionM], truth_m: &[PositionM]) ->
 
 fn compression(m: usize, kept: usize) -> Option<f64> {
     (kept > 0).then(|| m as f64 / kept as f64)
+}
+
+fn smoothing(args: &Args, recipe: &Recipe) -> Smoothing {
+    args.smooth.unwrap_or(Smoothing::usual(recipe.name))
 }
 
 fn truth(args: &Args, survey: &Survey) -> anyhow::Result<Vec<PositionM>> {

@@ -5,7 +5,7 @@ use std::path::Path;
 use serde_json::json;
 
 use super::printable;
-use crate::map::{FeatureMap, GroupHyperparameters};
+use crate::map::{FeatureMap, GroupHyperparameters, TrackReport};
 
 pub fn as_json(path: &Path, map: &FeatureMap, size_bytes: u64) -> serde_json::Value {
     json!({
@@ -26,6 +26,9 @@ pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {
     ];
     for recording in &info.recordings {
         lines.push(("trained on", format!("{}, {} frames", recording.name, recording.frames)));
+        if let Some(track) = &recording.track {
+            lines.push(("positions", positions(track)));
+        }
     }
     let selection = if info.groups.iter().any(|group| group.features < group.rank) { "chosen" } else { "all kept" };
     lines.push(("recipe", format!("{}, features {selection}", info.recipe.name())));
@@ -97,6 +100,16 @@ pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {
         );
     }
     text
+}
+
+fn positions(track: &TrackReport) -> String {
+    match track {
+        TrackReport::Smoothed { receiver_std_m, receiver_time_s, moved_m, remaining_std_m, views } => format!(
+            "moved by {moved_m:.2} m; receiver errs by {receiver_std_m:.2} m an axis, alike for {receiver_time_s:.0} s; \
+             {remaining_std_m:.2} m an axis remain; {views} matches with other passes"
+        ),
+        TrackReport::LeftAlone(why) => format!("as recorded: {}", why.describe()),
+    }
 }
 
 fn hyperparameters(hyperparameters: &GroupHyperparameters) -> String {

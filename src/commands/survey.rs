@@ -11,7 +11,7 @@ use crate::features::Descriptor;
 use crate::map::{PERTURBED_COPIES, Recipe};
 use crate::recording::Recording;
 use crate::train::{Survey, SurveyOptions, TrialError};
-use crate::types::{PositionM, distance_m};
+use crate::types::{NS_PER_S, PositionM, distance_m};
 
 /// Learning takes time with the third power of the number of frames: more than this many are thinned out.
 const MAX_FRAMES: usize = 800;
@@ -75,6 +75,25 @@ fn refuse_copies(recordings: &[Recording]) -> Result<(), BadArgument> {
     }
     Ok(())
 }
+
+/// How many times the recordings saw their place: those that began within [`ONE_APPEARANCE_S`] of another are one with it.
+/// A recording that does not know the date counts by itself.
+pub fn appearances(recordings: &[Recording]) -> usize {
+    let began_ns = |recording: &Recording| recording.topics.values().map(|summary| summary.first_ns).min().unwrap_or(0);
+    appearances_begun(&recordings.iter().map(began_ns).collect::<Vec<_>>())
+}
+
+fn appearances_begun(log_times_ns: &[u64]) -> usize {
+    // Log times before this count from when the computer was switched on, or from the first image: 2001-09-09.
+    const FIRST_DATE_NS: u64 = 1_000_000_000 * NS_PER_S;
+    let mut dates_ns: Vec<u64> = log_times_ns.iter().copied().filter(|&ns| ns > FIRST_DATE_NS).collect();
+    dates_ns.sort_unstable();
+    let repeated = dates_ns.windows(2).filter(|pair| pair[1] - pair[0] < ONE_APPEARANCE_S * NS_PER_S).count();
+    log_times_ns.len() - repeated
+}
+
+/// The light changes, and traffic and parked cars are others \[s\].
+const ONE_APPEARANCE_S: u64 = 3 * 3600;
 
 fn open_all(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
     for (i, path) in paths.iter().enumerate() {
@@ -193,4 +212,25 @@ pub fn read_truth(path: &std::path::Path, survey: &Survey) -> anyhow::Result<Vec
         eprintln!("warning: {}: {extra} lines belong to no frame; is it the truth of this recording?", path.display());
     }
     Ok(positions_m)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn laps_of_one_hour_are_one_appearance_and_unknown_dates_count_each() {
+        const HOUR_NS: u64 = 3600 * NS_PER_S;
+        let noon = 1_750_000_000 * NS_PER_S;
+        let table: [(&[u64], usize); 5] = [
+            (&[noon], 1),
+            (&[noon, noon + HOUR_NS / 2, noon + HOUR_NS], 1),
+            (&[noon + 8 * HOUR_NS, noon], 2),
+            (&[noon, noon + 24 * HOUR_NS, noon + 25 * HOUR_NS], 2),
+            (&[0, 0], 2),
+        ];
+        for (log_times_ns, expected) in table {
+            assert_eq!(appearances_begun(log_times_ns), expected, "{log_times_ns:?}");
+        }
+    }
 }

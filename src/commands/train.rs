@@ -7,11 +7,12 @@ use super::map_report;
 use super::options::{OutputKind, check_not_input, check_output};
 use super::progress::Progress;
 use super::survey::{
-    bad_argument, default_grid_step_m, in_one_place, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
+    appearances, bad_argument, default_grid_step_m, in_one_place, open_recordings, parse_descriptor, parse_spacing_m,
+    read_to_learn,
 };
 use super::{DONE, print};
 use crate::features::Descriptor;
-use crate::map::{Recipe, RecipeName, Selection, SplitKind, file};
+use crate::map::{Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
 use crate::recording::write_bytes_atomically;
 use crate::train::{TrainSettings, train};
 
@@ -51,6 +52,10 @@ pub struct Args {
     /// Leave out frames that are closer than this to the one before [m; default: as many as make 800 frames]
     #[arg(long, value_name = "M", value_parser = parse_spacing_m)]
     pub spacing_m: Option<f64>,
+    /// Correct the recorded positions before learning, by how the vehicle moved and by places seen more than once
+    /// [default: track for the default recipe, none for the paper's]
+    #[arg(long, value_enum)]
+    pub smooth: Option<Smoothing>,
     /// Replace the output if it exists
     #[arg(long)]
     pub force: bool,
@@ -75,6 +80,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         seed: args.seed,
         grid_step_m: args.grid_step_m.unwrap_or_else(|| default_grid_step_m(&survey.positions_m())),
         within_m: args.within_m,
+        smoothing: args.smooth.unwrap_or(Smoothing::usual(args.recipe)),
     };
     let sources: Vec<String> = recordings.iter().map(|recording| recording.name.clone()).collect();
     let map =
@@ -82,6 +88,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let bytes = file::to_bytes(&map);
     write_bytes_atomically(&args.out, &bytes)?;
     progress.finish();
+    if appearances(&recordings) < 2 {
+        eprintln!(
+            "warning: the map has seen its place only once: in other light or after a change it will err more; record it \
+             again on another day and name all recordings"
+        );
+    }
     if let Some(figures) = map.info.validation.last().filter(|figures| figures.skill < MIN_SKILL) {
         eprintln!(
             "warning: on the frames held back the map errs by {:.1} m (RMSE), hardly less than always answering the median \

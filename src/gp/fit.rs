@@ -93,7 +93,7 @@ pub fn fit_each(
     bounds: &Bounds,
     on_done: impl Fn() + Sync,
 ) -> Vec<Fit> {
-    let spacing_m = median_neighbour_spacing_m(learning.positions());
+    let spacing_m = learning.spacing_m();
     let starts = starts(learning, features, bounds);
     starts
         .into_par_iter()
@@ -218,13 +218,15 @@ pub fn extent_m(positions: &[PositionM]) -> [f64; 2] {
 /// Positions closer than this are one place: a receiver slower than the camera repeats its fixes.
 const SAME_PLACE_M: f64 = 1e-6;
 
-/// Median over the positions of the distance to the nearest position elsewhere \[m\]: several images of one place count as
-/// one place. Zero where all positions are one.
-pub fn median_neighbour_spacing_m(positions: &[PositionM]) -> f64 {
+/// Median over the positions of the distance to the nearest position elsewhere in the same recording \[m\]: several images
+/// of one place count as one place. Zero where all positions of a recording are one.
+pub(super) fn median_neighbour_spacing_m(positions: &[PositionM], recording: &[usize]) -> f64 {
     let mut nearest: Vec<f64> = positions
         .iter()
-        .filter_map(|&p| {
-            let distances = positions.iter().map(|&q| crate::types::distance_m(p, q));
+        .zip(recording)
+        .filter_map(|(&p, of_p)| {
+            let same = positions.iter().zip(recording).filter(|(_, of_q)| *of_q == of_p);
+            let distances = same.map(|(&q, _)| crate::types::distance_m(p, q));
             distances.filter(|&distance_m| distance_m > SAME_PLACE_M).min_by(f64::total_cmp)
         })
         .collect();
@@ -335,8 +337,8 @@ mod tests {
     #[test]
     fn repeated_positions_do_not_shrink_the_spacing() {
         let held: Vec<PositionM> = (0..30).map(|i| [f64::from(i / 3) * 2.0, 0.0]).collect();
-        assert_eq!(median_neighbour_spacing_m(&held), 2.0);
-        assert_eq!(median_neighbour_spacing_m(&[[1.0, 1.0]; 4]), 0.0);
+        assert_eq!(LearningPositions::new(held).spacing_m(), 2.0);
+        assert_eq!(LearningPositions::new(vec![[1.0, 1.0]; 4]).spacing_m(), 0.0);
     }
 
     #[test]

@@ -31,14 +31,30 @@ pub struct LearningPositions {
     positions: Vec<PositionM>,
     /// (s_i − s_j)² on either axis, n × n \[m²\].
     squared_distance_m2: [Mat<f64>; 2],
+    spacing_m: f64,
 }
 
 impl LearningPositions {
+    /// Positions of one recording.
     pub fn new(positions: Vec<PositionM>) -> Self {
+        let recording = vec![0; positions.len()];
+        Self::of_recordings(positions, &recording)
+    }
+
+    /// Positions with the number of the recording each is from: a second recording of a street does not make its fields
+    /// change faster, so that the [`spacing`](Self::spacing_m) is that within recordings.
+    pub fn of_recordings(positions: Vec<PositionM>, recording: &[usize]) -> Self {
         let n = positions.len();
+        let spacing_m = fit::median_neighbour_spacing_m(&positions, recording);
         let squared_distance_m2 =
             [0, 1].map(|axis| Mat::from_fn(n, n, |i, j| (positions[i][axis] - positions[j][axis]).powi(2)));
-        Self { positions, squared_distance_m2 }
+        Self { positions, squared_distance_m2, spacing_m }
+    }
+
+    /// Some of the positions, with the spacing of all.
+    pub fn of_rows(&self, rows: &[usize]) -> Self {
+        let positions = rows.iter().map(|&row| self.positions[row]).collect();
+        Self { spacing_m: self.spacing_m, ..Self::new(positions) }
     }
 
     pub fn len(&self) -> usize {
@@ -51,6 +67,12 @@ impl LearningPositions {
 
     pub fn positions(&self) -> &[PositionM] {
         &self.positions
+    }
+
+    /// Median distance to the nearest position elsewhere in the same recording \[m\]; zero where all positions of a
+    /// recording are one.
+    pub fn spacing_m(&self) -> f64 {
+        self.spacing_m
     }
 
     /// The kernel matrix K, n × n, lower triangle (the upper one is left zero).

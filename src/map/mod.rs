@@ -7,6 +7,7 @@
 mod cells;
 pub mod file;
 mod recipe;
+mod track;
 
 use faer::Mat;
 use serde::{Deserialize, Serialize};
@@ -17,6 +18,7 @@ pub use recipe::{
     GroupHyperparameters, GroupRecipe, Model, NoiseModel, NoiseWhiteningSettings, PERTURBED_COPIES, Recipe, RecipeName,
     Selection, SplitKind,
 };
+pub use track::{NotATrack, Smoothing, TrackReport};
 
 use crate::features::scaling::Scaling;
 use crate::gp::Hyperparameters;
@@ -72,6 +74,9 @@ pub struct MapInfo {
 pub struct TrainedOn {
     pub name: String,
     pub frames: usize,
+    /// What was made of its positions; `None` where they were to be taken as they are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub track: Option<TrackReport>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -200,7 +205,7 @@ pub(crate) mod tests {
             info: MapInfo {
                 format_version: FORMAT_VERSION,
                 program: "0.0.0".into(),
-                recordings: vec![TrainedOn { name: "yard".into(), frames: 3 }],
+                recordings: vec![TrainedOn { name: "yard".into(), frames: 3, track: None }],
                 recipe: RecipeName::Default,
                 selection: Selection::None,
                 refine: true,

@@ -16,7 +16,7 @@ use super::{
     scan::{Scan, parse_calibration},
     topics,
 };
-use crate::types::{DonutCalibration, Geodetic, LocalFrame, PositionM, distance_m};
+use crate::types::{DonutCalibration, Geodetic, LocalFrame, NS_PER_S, PositionM, distance_m};
 
 /// What is known of the place one frame was taken at.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,6 +39,14 @@ pub struct SurveyFrame {
     pub serial_latency_m: Option<f64>,
     /// `time_s` as the data set wrote it. `None`: from a camera, or the data set has no times and `stamp_ns` only counts.
     pub time_s: Option<f64>,
+}
+
+impl SurveyFrame {
+    /// When the frame was taken, on the recording's own clock; `None` where its stamp only counts.
+    pub fn known_time_s(&self) -> Option<f64> {
+        let from_camera = self.source_file.is_empty();
+        (from_camera || self.time_s.is_some()).then_some(self.stamp_ns as f64 / NS_PER_S as f64)
+    }
 }
 
 /// How often a topic was written to, and when.

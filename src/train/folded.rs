@@ -12,7 +12,6 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use super::group::LearnedGroup;
-use crate::gp::fit::median_neighbour_spacing_m;
 use crate::gp::{GpError, LearningPositions};
 use crate::localize::FieldOnCells;
 use crate::map::CandidateCells;
@@ -47,7 +46,7 @@ pub fn folded_selection(
     let order = by_predictability(group, learning)?;
     let sizes = sizes(order.len());
     let centers_m = cells.centers_m();
-    let near_m = cells.grid.step_m.max(median_neighbour_spacing_m(learning.positions()));
+    let near_m = cells.grid.step_m.max(learning.spacing_m());
     let mut shuffled: Vec<usize> = (0..learning.len()).collect();
     shuffled.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
 
@@ -56,7 +55,7 @@ pub fn folded_selection(
     for fold in 0..FOLDS.min(learning.len()) {
         let held: Vec<usize> = shuffled.iter().copied().skip(fold).step_by(FOLDS).collect();
         let rest: Vec<usize> = (0..learning.len()).filter(|row| !held.contains(row)).collect();
-        let positions = LearningPositions::new(rest.iter().map(|&row| learning.positions()[row]).collect());
+        let positions = learning.of_rows(&rest);
         let field = group.of_rows(&rest).on_cells(&positions, &centers_m)?;
         for (size, scores) in sizes.iter().zip(&mut scores) {
             let kept = &order[..*size];

@@ -10,19 +10,20 @@ pub mod perturbation;
 mod split;
 mod subset;
 mod survey;
+mod track;
 mod trial;
 
 pub use group::{LearnError, LearnedGroup};
 pub use split::{Split, SplitError};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
+pub use track::{Similarity, Smoothed, TrackSmoother};
 pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
 
 use crate::gp::LearningPositions;
-use crate::gp::fit::median_neighbour_spacing_m;
 use crate::map::{
-    CandidateCells, FORMAT_VERSION, FeatureMap, GroupInfo, MapGroup, MapInfo, Recipe, Selection, SplitKind, TrainedOn,
-    ValidationFigures,
+    CandidateCells, FORMAT_VERSION, FeatureMap, GroupInfo, MapGroup, MapInfo, Recipe, Selection, Smoothing, SplitKind,
+    TrackReport, TrainedOn, ValidationFigures,
 };
 use crate::metrics::{ErrorFigures, component_median};
 
@@ -35,6 +36,7 @@ pub struct TrainSettings {
     /// Only cells at most this far from a learning position become candidates; [`NEAR_SPACINGS`] × the spacing of the
     /// positions if not given.
     pub within_m: Option<f64>,
+    pub smoothing: Smoothing,
 }
 
 /// Cells further than this many median spacings from every learning position are left out.
@@ -43,7 +45,8 @@ pub const NEAR_SPACINGS: f64 = 7.0;
 /// Makes a map of all frames of `survey`: Algorithm 1 of Do et al. (2015).
 ///
 /// A quarter of the frames is first held back to choose features and to measure on. The map itself is then of all
-/// frames: a recipe without selection learns again from all; after a selection, the scaling and hyperparameters that it
+/// frames, at positions that `settings.smoothing` made of those recorded: a recipe without selection learns again from all;
+/// after a selection, the scaling and hyperparameters that it
 /// was made with are kept and the Gaussian processes conditioned on all frames. `sources` names the recordings.
 pub fn train(
     survey: &Survey,
@@ -56,10 +59,16 @@ pub fn train(
     let mut split = Split::new(settings.split, survey.len(), settings.seed);
     split.learning.append(&mut split.test);
     split.learning.sort_unstable();
+    let tracks = match settings.smoothing {
+        Smoothing::None => None,
+        Smoothing::Track => Some((TrackSmoother::new(survey, &positions_m), Similarity::of(survey, recipe))),
+    };
+    let smoothed = |rows: &[usize]| tracks.as_ref().map(|(tracks, views)| tracks.smoothed(rows, views.as_ref()));
+    let held_out = smoothed(&split.learning);
     // Measured before anything is learned from the validation frames.
+    let held_out_m = held_out.as_ref().map_or(&positions_m, |smoothed| &smoothed.positions_m);
     let held_back = Recipe { refit: false, ..recipe.clone() };
-    let trial =
-        Trial { recipe: &held_back, split: &split, grid_step_m: settings.grid_step_m, recorded_m: &positions_m };
+    let trial = Trial { recipe: &held_back, split: &split, grid_step_m: settings.grid_step_m, recorded_m: held_out_m };
     let outcomes = run(survey, &trial, &on_step)?;
     let learning_m: Vec<_> = split.learning.iter().map(|&row| positions_m[row]).collect();
     let know_nothing_m = component_median(&learning_m);
@@ -78,12 +87,18 @@ pub fn train(
     });
     let validation = validation.collect();
 
-    let learning = LearningPositions::new(positions_m);
-    let near_m = NEAR_SPACINGS * median_neighbour_spacing_m(learning.positions());
+    let everything: Vec<usize> = (0..survey.len()).collect();
+    let smoothed = smoothed(&everything);
+    let reports: Vec<Option<TrackReport>> = match &smoothed {
+        Some(smoothed) => smoothed.reports.iter().copied().map(Some).collect(),
+        None => vec![None; sources.len()],
+    };
+    let learned_m = smoothed.map_or(positions_m, |smoothed| smoothed.positions_m);
+    let learning = LearningPositions::of_recordings(learned_m, &survey.recordings_of(&everything));
+    let near_m = NEAR_SPACINGS * learning.spacing_m();
     let within_m = settings.within_m.unwrap_or(near_m.max(2.0 * settings.grid_step_m));
     let cells = CandidateCells::around(learning.positions(), settings.grid_step_m, Some(within_m))?;
     let centers_m = cells.centers_m();
-    let everything: Vec<usize> = (0..survey.len()).collect();
     let (mut infos, mut groups) = (Vec::new(), Vec::new());
     for selected in outcomes.groups.into_iter().filter(|group| group.features() > 0) {
         let descriptor = selected.recipe.descriptor;
@@ -117,7 +132,8 @@ pub fn train(
         recordings: sources
             .iter()
             .enumerate()
-            .map(|(i, name)| TrainedOn { name: name.clone(), frames: frames_of(i) })
+            .zip(reports)
+            .map(|((i, name), track)| TrainedOn { name: name.clone(), frames: frames_of(i), track })
             .collect(),
         recipe: recipe.name,
         selection: recipe.selection,

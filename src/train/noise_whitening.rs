@@ -10,7 +10,7 @@ use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_uppe
 use faer::{Mat, MatRef, Par, Side};
 
 use crate::features::scaling::{Scaling, ScalingError};
-use crate::gp::{Hyperparameters, LearningPositions, fit::median_neighbour_spacing_m};
+use crate::gp::{Hyperparameters, LearningPositions};
 use crate::map::NoiseWhiteningSettings;
 
 /// What is learned: the scaling, and one set of hyperparameters for all features.
@@ -59,7 +59,7 @@ pub fn learn(
     let basis = svd.V().subcols(0, rank);
     let z = Mat::from_fn(n, rank, |i, r| svd.U()[(i, r)] * singular[r]);
 
-    let length_m = (settings.length_scale_spacings * median_neighbour_spacing_m(learning.positions())).max(1e-6);
+    let length_m = (settings.length_scale_spacings * learning.spacing_m()).max(1e-6);
     let unit = Hyperparameters { signal_std: 1.0, noise_std: 0.0, length_scale_m: [length_m; 2] };
     let loo = leave_one_out(learning, z.as_ref(), &unit);
 

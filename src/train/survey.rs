@@ -33,6 +33,8 @@ pub struct SurveyedFrame {
     pub stamp_ns: u64,
     pub position_m: PositionM,
     pub yaw_rad: Option<f64>,
+    /// On the recording's own clock; `None` where stamps only count.
+    pub time_s: Option<f64>,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -192,6 +194,7 @@ impl Survey {
                 stamp_ns: frame.stamp_ns,
                 position_m: frame.position_m,
                 yaw_rad: frame.yaw_rad,
+                time_s: frame.known_time_s(),
             });
             for (descriptor, (clean, changes)) in options.descriptors.iter().zip(properties) {
                 let of_descriptor = self.properties.get_mut(descriptor).expect("made for these descriptors");
@@ -213,6 +216,11 @@ impl Survey {
     /// Positions as recorded \[m\].
     pub fn positions_m(&self) -> Vec<PositionM> {
         self.frames.iter().map(|frame| frame.position_m).collect()
+    }
+
+    /// The recordings that the frames at `rows` are from.
+    pub fn recordings_of(&self, rows: &[usize]) -> Vec<usize> {
+        rows.iter().map(|&row| self.frames[row].recording).collect()
     }
 
     /// Properties of the frames at `rows`, n × d.

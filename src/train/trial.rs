@@ -25,7 +25,8 @@ pub struct Trial<'a> {
     pub recipe: &'a Recipe,
     pub split: &'a Split,
     pub grid_step_m: f64,
-    /// Positions to learn from and to select on, one a frame of the survey.
+    /// Positions to learn from and to select on, one a frame of the survey; whatever was done to them, the test frames'
+    /// images had no part in it.
     pub recorded_m: &'a [PositionM],
 }
 
@@ -140,7 +141,7 @@ fn run_once(
 ) -> Result<Outcomes, TrialError> {
     let at = |rows: &[usize]| -> Vec<PositionM> { rows.iter().map(|&row| trial.recorded_m[row]).collect() };
     let split = trial.split;
-    let learning = LearningPositions::new(at(learning_rows));
+    let learning = LearningPositions::of_recordings(at(learning_rows), &survey.recordings_of(learning_rows));
     if learning.len() < MIN_LEARNING || split.validation.is_empty() {
         return Err(TrialError::TooFewFrames { learning: learning.len(), validation: split.validation.len() });
     }

@@ -1,0 +1,209 @@
+//! Tracks whose truth is known.
+
+use faer::Mat;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::*;
+use crate::train::perturbation::standard_normal;
+
+const RECEIVER_STD_M: f64 = 0.6;
+const RECEIVER_TIME_S: f64 = 20.0;
+
+/// Laps of a block of 60 by 40 m with round corners, 1.5 m/s at 1 Hz: truth and course.
+fn laps(frames: usize) -> Vec<(PositionM, f64)> {
+    let corner_m = 5.0;
+    let sides_m = [60.0, 40.0, 60.0, 40.0];
+    let quarter_m = corner_m * std::f64::consts::FRAC_PI_2;
+    (0..frames)
+        .map(|i| {
+            // The speed varies.
+            let mut way_m = 1.5 * i as f64 + 2.0 * (0.05 * i as f64).sin();
+            let (mut at, mut course_rad) = ([0.0, 0.0], 0.0_f64);
+            for side in (0..4).cycle() {
+                let (sin, cos) = course_rad.sin_cos();
+                let straight_m: f64 = way_m.min(sides_m[side]);
+                at = [at[0] + straight_m * cos, at[1] + straight_m * sin];
+                way_m -= straight_m;
+                let turn_rad = way_m.min(quarter_m) / corner_m;
+                let (forward_m, left_m) = (corner_m * turn_rad.sin(), corner_m * (1.0 - turn_rad.cos()));
+                at = [at[0] + forward_m * cos - left_m * sin, at[1] + forward_m * sin + left_m * cos];
+                course_rad += turn_rad;
+                way_m -= turn_rad * corner_m;
+                if way_m <= 0.0 {
+                    break;
+                }
+            }
+            (at, course_rad)
+        })
+        .collect()
+}
+
+/// What a receiver says of it, with a yaw that is off by `yaw_offset_rad`.
+fn received(truth: &[(PositionM, f64)], seed: u64, yaw_offset_rad: f64) -> Vec<TrackPoint> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut normal = || f64::from(standard_normal(&mut random));
+    let kept = (-1.0 / RECEIVER_TIME_S).exp();
+    let mut error_m = [RECEIVER_STD_M * normal(), RECEIVER_STD_M * normal()];
+    truth
+        .iter()
+        .enumerate()
+        .map(|(i, (position_m, course_rad))| {
+            error_m = error_m.map(|error_m| kept * error_m + RECEIVER_STD_M * (1.0 - kept * kept).sqrt() * normal());
+            TrackPoint {
+                position_m: [position_m[0] + error_m[0], position_m[1] + error_m[1]],
+                yaw_rad: Some(course_rad + yaw_offset_rad + 0.01 * normal()),
+                time_s: Some(i as f64),
+            }
+        })
+        .collect()
+}
+
+/// Images of 40 properties that follow the place at about the scale of metres, and noise of the day.
+fn similarity(truth: &[PositionM]) -> Similarity {
+    let mut random = ChaCha8Rng::seed_from_u64(99);
+    let mut normal = || f64::from(standard_normal(&mut random));
+    let waves: Vec<[f64; 3]> = (0..40).map(|_| [0.3 * normal(), 0.3 * normal(), 3.0 * normal()]).collect();
+    let properties = Mat::from_fn(truth.len(), 40, |i, k| {
+        let [east, north, phase] = waves[k];
+        (east * truth[i][0] + north * truth[i][1] + phase).sin() + 0.1 * normal()
+    });
+    let changes = Mat::from_fn(truth.len(), 40, |_, _| 0.1 * normal());
+    Similarity::learn(properties.as_ref(), changes.as_ref()).expect("it varies")
+}
+
+fn rmse_m(positions_m: &[PositionM], truth_m: &[PositionM]) -> f64 {
+    let squares: f64 = positions_m.iter().zip(truth_m).map(|(&a, &b)| distance_m(a, b).powi(2)).sum();
+    (squares / positions_m.len() as f64).sqrt()
+}
+
+/// The same without the part of the error that is the same everywhere.
+fn rmse_about_mean_m(positions_m: &[PositionM], truth_m: &[PositionM]) -> f64 {
+    let mean = |axis: usize| {
+        positions_m.iter().zip(truth_m).map(|(a, b)| a[axis] - b[axis]).sum::<f64>() / positions_m.len() as f64
+    };
+    let mean = [mean(0), mean(1)];
+    rmse_m(&positions_m.iter().map(|p| [p[0] - mean[0], p[1] - mean[1]]).collect::<Vec<_>>(), truth_m)
+}
+
+fn positions(points: &[TrackPoint]) -> Vec<PositionM> {
+    points.iter().map(|point| point.position_m).collect()
+}
+
+#[test]
+fn motion_takes_off_part_of_the_error_and_views_most_of_it() {
+    let truth = laps(300);
+    let truth_m: Vec<PositionM> = truth.iter().map(|(position_m, _)| *position_m).collect();
+    let images = similarity(&truth_m);
+    let everything: Vec<usize> = (0..300).collect();
+    let mut sums = [0.0; 3];
+    for seed in 0..4 {
+        // A camera that looks to the left does not matter.
+        let points = received(&truth, seed, 1.5);
+        let smoother = TrackSmoother::of_points(&points, &[0; 300]);
+        let by_motion = smoother.smoothed(&everything, None);
+        let by_views = smoother.smoothed(&everything, Some(&images));
+        let TrackReport::Smoothed { receiver_std_m, views, remaining_std_m, .. } = by_views.reports[0] else {
+            panic!("a track: {:?}", by_views.reports)
+        };
+        assert!((0.3..1.2).contains(&receiver_std_m), "{receiver_std_m}");
+        assert!(views > 50 && remaining_std_m < receiver_std_m, "{views} {remaining_std_m}");
+        for (sum, of) in sums.iter_mut().zip([&positions(&points), &by_motion.positions_m, &by_views.positions_m]) {
+            *sum += rmse_about_mean_m(of, &truth_m);
+        }
+    }
+    let [received, by_motion, by_views] = sums;
+    assert!(by_motion < 0.85 * received, "{by_motion} of {received}");
+    assert!(by_views < 0.65 * received, "{by_views} of {received}");
+}
+
+#[test]
+fn two_recordings_agree_afterwards_between_what_their_receivers_said() {
+    let truth = laps(150);
+    let truth_m: Vec<PositionM> = truth.iter().map(|(position_m, _)| *position_m).collect();
+    let mut points = received(&truth, 1, 0.0);
+    // The second receiver is off by 1.6 m east for the whole drive.
+    points.extend(received(&truth, 2, 0.0).into_iter().map(|mut point| {
+        point.position_m[0] += 1.6;
+        point
+    }));
+    let recording: Vec<usize> = (0..300).map(|i| i / 150).collect();
+    let smoother = TrackSmoother::of_points(&points, &recording);
+    let both_m = [truth_m.clone(), truth_m.clone()].concat();
+    let everything: Vec<usize> = (0..300).collect();
+    let smoothed = smoother.smoothed(&everything, Some(&similarity(&both_m)));
+    let apart = |positions_m: &[PositionM]| rmse_m(&positions_m[..150], &positions_m[150..]);
+    let (before_m, after_m) = (apart(&positions(&points)), apart(&smoothed.positions_m));
+    assert!(after_m < 0.5 * before_m, "{after_m} of {before_m}");
+    // Where they agree lies between what they said; where between depends on how steady each receiver looks.
+    let mean_m = |positions_m: &[PositionM]| positions_m.iter().map(|p| p[0]).sum::<f64>() / positions_m.len() as f64;
+    let (received, agreed_m) = (positions(&points), mean_m(&smoothed.positions_m));
+    let (one_m, other_m) = (mean_m(&received[..150]), mean_m(&received[150..]));
+    assert!((one_m..other_m).contains(&agreed_m), "{one_m} {agreed_m} {other_m}");
+}
+
+#[test]
+fn a_jump_of_the_receiver_is_taken_off_and_does_not_spoil_the_rest() {
+    let truth = laps(200);
+    let truth_m: Vec<PositionM> = truth.iter().map(|(position_m, _)| *position_m).collect();
+    let mut points = received(&truth, 5, 0.0);
+    let calm = TrackSmoother::of_points(&points, &[0; 200]).smoothed(&[], None).positions_m;
+    points[100..104].iter_mut().for_each(|point| point.position_m[1] += 15.0);
+    let jumped = TrackSmoother::of_points(&points, &[0; 200]).smoothed(&[], None).positions_m;
+    assert!(distance_m(jumped[102], truth_m[102]) < 3.0, "{:?} {:?}", jumped[102], truth_m[102]);
+    let without_jump = |p: &[PositionM]| [&p[..95], &p[110..]].concat();
+    let (jumped_m, calm_m) = (
+        rmse_m(&without_jump(&jumped), &without_jump(&truth_m)),
+        rmse_m(&without_jump(&calm), &without_jump(&truth_m)),
+    );
+    assert!(jumped_m < calm_m + 0.3, "{jumped_m} {calm_m}");
+}
+
+#[test]
+fn exact_positions_hardly_move() {
+    let truth = laps(200);
+    let points: Vec<TrackPoint> = (truth.iter().zip(received(&truth, 3, 0.0)))
+        .map(|((position_m, _), point)| TrackPoint { position_m: *position_m, ..point })
+        .collect();
+    let smoothed = TrackSmoother::of_points(&points, &[0; 200]).smoothed(&[], None);
+    assert!(rmse_m(&smoothed.positions_m, &positions(&points)) < 0.05, "{:?}", smoothed.reports);
+}
+
+#[test]
+fn what_is_no_track_is_left_alone() {
+    let good = received(&laps(100), 7, 0.0);
+    let change = |spoil: fn(usize, &mut TrackPoint)| {
+        let mut points = good.clone();
+        points.iter_mut().enumerate().for_each(|(i, point)| spoil(i, point));
+        points
+    };
+    let table: [(&str, Vec<TrackPoint>, NotATrack); 6] = [
+        ("no time", change(|i, point| point.time_s = point.time_s.filter(|_| i != 40)), NotATrack::NoTime),
+        ("no yaw", change(|_, point| point.yaw_rad = None), NotATrack::NoYaw),
+        ("short", good[..10].to_vec(), NotATrack::TooFewFrames),
+        ("random yaw", change(|i, point| point.yaw_rad = Some((i * i) as f64)), NotATrack::NotAlongYaw),
+        (
+            "lattice",
+            change(|i, point| (point.position_m, point.yaw_rad) = ([(i % 10) as f64, (i / 10) as f64], Some(0.0))),
+            NotATrack::NotAlongYaw,
+        ),
+        ("standing", change(|_, point| point.position_m = [1.0, 2.0]), NotATrack::NotAlongYaw),
+    ];
+    for (case, points, why) in table {
+        let recording = vec![0; points.len()];
+        let smoothed = TrackSmoother::of_points(&points, &recording).smoothed(&[], None);
+        assert_eq!(smoothed.reports, [TrackReport::LeftAlone(why)], "{case}");
+        assert_eq!(smoothed.positions_m, positions(&points), "{case}");
+    }
+}
+
+#[test]
+fn a_recording_that_is_no_track_stays_beside_one_that_is() {
+    let mut points = received(&laps(100), 7, 0.0);
+    points.extend(received(&laps(50), 8, 0.0).into_iter().map(|point| TrackPoint { yaw_rad: None, ..point }));
+    let recording: Vec<usize> = (0..150).map(|i| i / 100).collect();
+    let smoothed = TrackSmoother::of_points(&points, &recording).smoothed(&[], None);
+    assert!(matches!(smoothed.reports[..], [TrackReport::Smoothed { .. }, TrackReport::LeftAlone(NotATrack::NoYaw)]));
+    assert_eq!(smoothed.positions_m[100..], positions(&points)[100..]);
+    assert_ne!(smoothed.positions_m[..100], positions(&points)[..100]);
+}
