@@ -20,7 +20,7 @@ PLACES = [*(f"town-{seed}" for seed in range(101, 108)), *(f"corridor-{seed}" fo
 QUICK = ["town-101", "corridor-101"]
 # What settings are chosen on: never reported.
 TUNING = ["town-11", "town-12", "corridor-11", "hall-11"]
-METHODS = ("default", "paper", *retrieval.PEERS)
+METHODS = ("default", *retrieval.PEERS, "paper")
 NAMES = {"default": "omniloc", "paper": "paper's recipe", "aligned": "aligned retrieval", "sift-vlad": "SIFT-VLAD"}
 STEPS = (1, 2, 4, 8)
 SPLITS = 5
@@ -46,24 +46,22 @@ def kept(name, stamp, compute):
     return estimates_m
 
 
-def measure(name, described, learning, tests):
+def measure(name, described, learning, tests, methods):
     """Errors of every method for the frames of all `tests`, with a map of `learning`; `described`: which sets these are."""
     errors_m = {}
     truth_m = np.concatenate([test.truth_m for test in tests])
     queries = [image for test in tests for image in test.images]
-    for recipe in RECIPES:
-        estimates_m = kept(f"{name}-{recipe}", [described, program()], lambda: ours(recipe, learning, tests))
-        errors_m[recipe] = np.linalg.norm(estimates_m - truth_m, axis=1)
-        say(f"{name}: {NAMES[recipe]} {summary(errors_m[recipe])}")
-    for peer, settings in retrieval.PEERS.items():
+    for method in methods:
         def found():
-            lens = retrieval.Lens.of(learning.folder)
-            only = {peer: settings}
-            return retrieval.estimates(only, lens, learning.images, learning.positions_m, queries)[peer]
+            if method in RECIPES:
+                return ours(method, learning, tests)
+            lens, only = retrieval.Lens.of(learning.folder), {method: retrieval.PEERS[method]}
+            return retrieval.estimates(only, lens, learning.images, learning.positions_m, queries)[method]
 
-        estimates_m = kept(f"{name}-{peer}", [described, settings.settings], found)
-        errors_m[peer] = np.linalg.norm(estimates_m - truth_m, axis=1)
-        say(f"{name}: {NAMES[peer]} {summary(errors_m[peer])}")
+        version = program() if method in RECIPES else retrieval.PEERS[method].settings
+        estimates_m = kept(f"{name}-{method}", [described, version], found)
+        errors_m[method] = np.linalg.norm(estimates_m - truth_m, axis=1)
+        say(f"{name}: {NAMES[method]} {summary(errors_m[method])}")
     return errors_m
 
 
@@ -90,14 +88,14 @@ def result(label, errors_m, days=None):
 
 
 def one_place(job):
-    place, days, frames = job
+    place, days, frames, methods = job
     cv2.setNumThreads(1)
     say(f"{place}: the place on {1 + len(days)} days")
     learning_frames, test_frames = counts(place, frames)
     learning = simulated(place, 1, learning_frames)
     tests = [simulated(place, day, test_frames) for day in days]
     label = f"{place}-days-{'-'.join(map(str, days))}-of-{frames}"
-    errors_m = measure(label, [label, str(DAYS)], learning, tests)
+    errors_m = measure(label, [label, str(DAYS)], learning, tests, methods)
     return result(place, errors_m, [(day, len(test.images)) for day, test in zip(days, tests)])
 
 
@@ -108,33 +106,38 @@ def counts(place, frames):
 
 def thinned(job):
     """The same place with every image, every 2nd, 4th, 8th to learn from."""
-    name, learning, tests, step = job
+    name, learning, tests, step, methods = job
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory(dir=WORK) as folder:
         part = learning.part(range(0, len(learning.images), step), Path(folder) / "thin")
         spacing_m = np.median(np.linalg.norm(np.diff(part.positions_m, axis=0), axis=1))
-        errors_m = measure(f"thin-{name}-{step}", [name, step], part, tests)
+        described = [name, step, len(part.images), [len(test.images) for test in tests]]
+        errors_m = measure(f"thin-{name}-{step}", described, part, tests, methods)
     return {**result(f"{name}, every {step}", errors_m), "step": step, "spacing_m": float(spacing_m)}
 
 
-def thin_jobs(frames, data):
+def thin_jobs(frames, data, methods):
     jobs = []
     if data:
-        jobs += [("drive-378", Dataset(data / "drive-378"), [Dataset(data / "drive-378-day2")], step) for step in STEPS]
+        jobs += [("drive-378", Dataset(data / "drive-378"), [Dataset(data / "drive-378-day2")], step, methods) for step in STEPS]
     for place in ("town-101", "town-102"):
         learning_frames, test_frames = counts(place, frames)
         learning, tests = simulated(place, 1, learning_frames), [simulated(place, day, test_frames) for day in (2, 3)]
-        jobs += [(place, learning, tests, step) for step in STEPS]
+        jobs += [(place, learning, tests, step, methods) for step in STEPS]
     return jobs
 
 
-def splits_of(dataset, splits):
+def splits_of(dataset, splits, methods):
     """Test errors of every method over splits: pairs of images learned from and images tested."""
     lens = retrieval.Lens.of(dataset.folder)
     panoramas = [lens.panorama(image) for image in dataset.images]
     truth_m = np.concatenate([dataset.truth_m[test] for _, test in splits])
-    errors_m = {recipe: np.linalg.norm(ours_split(recipe, dataset, splits) - truth_m, axis=1) for recipe in RECIPES}
-    for name, peer in retrieval.PEERS.items():
+    errors_m = {}
+    for name in methods:
+        if name in RECIPES:
+            errors_m[name] = np.linalg.norm(ours_split(name, dataset, splits) - truth_m, axis=1)
+            continue
+        peer = retrieval.PEERS[name]
         described = [peer.describe(panorama) for panorama in panoramas]
         found = []
         for learning, test in splits:
@@ -146,7 +149,7 @@ def splits_of(dataset, splits):
     return errors_m
 
 
-def courtyard(data):
+def courtyard(data, methods):
     dataset = Dataset(data / "courtyard-75")
     n = len(dataset.images)
     everyone = [([i for i in range(n) if i != left_out], [left_out]) for left_out in range(n)]
@@ -154,9 +157,9 @@ def courtyard(data):
     orders = [random.permutation(n) for _ in range(SPLITS)]
     halves = [(sorted(order[:3 * n // 4].tolist()), sorted(order[3 * n // 4:].tolist())) for order in orders]
     say("courtyard-75: leave one out")
-    rows = [result("leave one out", splits_of(dataset, everyone))]
+    rows = [result("leave one out", splits_of(dataset, everyone, methods))]
     say("courtyard-75: splits")
-    return rows + [result(f"a quarter left out, {SPLITS} splits", splits_of(dataset, halves))]
+    return rows + [result(f"a quarter left out, {SPLITS} splits", splits_of(dataset, halves, methods))]
 
 
 def tune(frames):
@@ -201,6 +204,7 @@ def arguments():
     parser.add_argument("--places", help="separated by commas: town-101, corridor-3, hall-1, ...")
     parser.add_argument("--days", default="2,3,4,5", help="days to measure, of 2 to 5")
     parser.add_argument("--frames", type=int, default=400, help="learning images of a town; everything else follows")
+    parser.add_argument("--methods", default=",".join(METHODS), help="default, paper, aligned, sift-vlad")
     parser.add_argument("--jobs", type=int, default=2, help="places at a time")
     for mode, what in (("quick", "two places, two days"), ("thin", "fewer and fewer learning images"),
                        ("courtyard", "real photographs"), ("tune", "settings of the peers")):
@@ -212,6 +216,7 @@ def main():
     args = arguments()
     cv2.setNumThreads(1)
     WORK.mkdir(parents=True, exist_ok=True)
+    methods = args.methods.split(",")
     data = Path(os.environ["OMNILOC_DATA"]) if "OMNILOC_DATA" in os.environ else None
     if args.tune:
         return tune(args.frames)
@@ -220,15 +225,16 @@ def main():
         if args.courtyard:
             if not data:
                 sys.exit("--courtyard needs OMNILOC_DATA=DIR with DIR/courtyard-75")
-            title, rows = "courtyard-75, photographs about 10 m apart, positions of a telephone", courtyard(data)
+            title = "courtyard-75, photographs about 10 m apart, positions of a telephone"
+            rows = courtyard(data, methods)
         elif args.thin:
-            title, rows = "Fewer learning images", list(pool.map(thinned, thin_jobs(args.frames, data)))
+            title, rows = "Fewer learning images", list(pool.map(thinned, thin_jobs(args.frames, data, methods)))
         else:
             places = args.places.split(",") if args.places else QUICK if args.quick else PLACES
             days = [2, 3] if args.quick else [int(day) for day in args.days.split(",")]
             frames = 240 if args.quick else args.frames
             title = f"Another day: day 1 learned, days {', '.join(map(str, days))} measured"
-            rows = list(pool.map(one_place, [(place, days, frames) for place in places]))
+            rows = list(pool.map(one_place, [(place, days, frames, methods) for place in places]))
     report = table(title, rows)
     report += f"\nRMSE (median; 95th percentile; share over 10 m), metres, single frames. {OMNILOC}, {program()}.\n"
     (WORK / f"{name}.md").write_text(report)

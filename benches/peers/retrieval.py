@@ -112,11 +112,9 @@ class SiftVlad:
 
     def vlad(self, descriptors):
         descriptors = descriptors.astype(np.float32)
-        vector = np.zeros((WORDS, 128), np.float32)
-        if len(descriptors):
-            distance = (self.words**2).sum(1) - 2 * descriptors @ self.words.T
-            word = distance.argmin(1)
-            np.add.at(vector, word, descriptors - self.words[word])
+        nearest = ((self.words**2).sum(1) - 2 * descriptors @ self.words.T).argmin(1)
+        belongs = (nearest == np.arange(WORDS)[:, None]).astype(np.float32)
+        vector = belongs @ descriptors - belongs.sum(1, keepdims=True) * self.words
         vector /= np.linalg.norm(vector, axis=1, keepdims=True) + 1e-9
         return vector.ravel() / (np.linalg.norm(vector) + 1e-9)
 
