@@ -47,12 +47,45 @@ fn a_simulated_drive_is_a_data_set_that_can_be_imported_and_made_again() {
 }
 
 #[test]
+fn a_hall_is_photographed_on_a_lattice_and_at_random_places() {
+    let temporary = tempfile::tempdir().expect("a temporary folder");
+    for (name, how, day, frames) in
+        [("survey", ["--spacing-m", "8"], "1", 10..=30), ("test", ["--frames", "4"], "2", 4..=4)]
+    {
+        let folder = temporary.path().join(name);
+        let mut command = omniloc();
+        command.args(["simulate", "--world", "hall", "--size", "640x360", "--day", day, "--tilt-deg", "1"]);
+        command.args(["--gain-db", "2", "--traffic", "0.5", "--season", "winter"]);
+        command.args(how).arg("--out").arg(&folder).assert().success();
+        let positions = fs::read_to_string(folder.join("positions.csv")).expect("positions");
+        let truth = fs::read_to_string(folder.join("truth.csv")).expect("truth");
+        assert!(frames.contains(&(positions.lines().count() - 1)), "{positions}");
+        for (line, exact) in positions.lines().zip(truth.lines()).skip(1) {
+            let fields: Vec<&str> = line.split(',').collect();
+            assert_eq!(format!("{},{},{}", fields[0], fields[2], fields[3]), exact, "positions are exact");
+            assert_eq!((fields.len(), fields[5]), (6, ""), "photographs follow in no order");
+        }
+        let recording = temporary.path().join(format!("{name}.mcap"));
+        omniloc().arg("import").arg(&folder).arg("--out").arg(recording).assert().success();
+    }
+}
+
+#[test]
 fn impossible_wishes_are_refused() {
     let temporary = tempfile::tempdir().expect("a temporary folder");
     let out = temporary.path().join("out");
-    for wish in
-        [["--size", "64"], ["--size", "32x32"], ["--length-m", "1e9"], ["--lane-shift-m", "nan"], ["--frames", "1"]]
-    {
+    for wish in [
+        ["--size", "64"],
+        ["--size", "32x32"],
+        ["--length-m", "1e9"],
+        ["--lane-shift-m", "nan"],
+        ["--frames", "1"],
+        ["--spacing-m", "2"],
+        ["--traffic", "-1"],
+        ["--gain-db", "100"],
+        ["--tilt-deg", "nan"],
+        ["--season", "monsoon"],
+    ] {
         omniloc().args(["simulate", "--out"]).arg(&out).args(wish).assert().code(2);
         assert!(!out.exists(), "{wish:?}");
     }

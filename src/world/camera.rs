@@ -2,7 +2,10 @@
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
-use super::render::{PANORAMA_COLUMNS, PANORAMA_ROWS};
+use super::{
+    random::{Stream, standard_normal, stream},
+    render::{PANORAMA_COLUMNS, PANORAMA_ROWS},
+};
 use crate::types::{AzimuthSense, CalibrationError, DonutCalibration, LensKind};
 
 /// A camera with a donut lens, mounted on a vehicle.
@@ -77,6 +80,18 @@ impl Camera {
     /// On a cart.
     pub fn corridor() -> Self {
         Self { height_m: 1.2, ..Self::town() }
+    }
+
+    /// In the hand.
+    pub fn hall() -> Self {
+        Self { height_m: 1.5, ..Self::town() }
+    }
+
+    /// Mounted anew: pitch and roll are off by `deviation_rad` each, every seed another way.
+    pub fn tilted(self, deviation_rad: f64, seed: u64) -> Self {
+        let mut random = stream(seed, Stream::Mount);
+        let mut off_rad = || deviation_rad * standard_normal(&mut random).clamp(-2.0, 2.0);
+        Self { pitch_rad: self.pitch_rad + off_rad(), roll_rad: self.roll_rad + off_rad(), ..self }
     }
 
     /// The same lens before a sensor of another size; everything counted in pixels goes with the height.

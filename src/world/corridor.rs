@@ -4,7 +4,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::{
-    World, WorldKind,
+    Lamp, World, WorldKind,
     paint::{Canvas, bright, pick},
     path::Corner,
     random::{Stream, fractal, stream, white},
@@ -20,13 +20,6 @@ const HEIGHT_M: f32 = 2.7;
 const TEXELS_PER_M: f32 = 50.0;
 /// Distance of the lines in which it is driven through.
 const LINE_SPACING_M: f64 = 0.3;
-
-/// A rectangle on the ceiling that shines.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Lamp {
-    pub center_m: [f32; 2],
-    pub half_m: [f32; 2],
-}
 
 pub(super) fn build(seed: u64, length_m: f64) -> World {
     let mut random = stream(seed, Stream::Layout);

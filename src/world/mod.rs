@@ -1,4 +1,4 @@
-//! Simulated places: a town block and a corridor, seen through a donut lens while a vehicle drives through them.
+//! Simulated places: a town block, a corridor and a hall, seen through a donut lens while a vehicle drives through them.
 //!
 //! Everything follows from seeds. A [`World`] is a place; a [`Day`] is its light, its parked cars, its traffic and people; a
 //! [`Drive`] says where the vehicle is at any instant; a [`Receiver`] says what a satellite receiver makes of that; a
@@ -23,8 +23,10 @@ mod camera;
 mod column;
 mod corridor;
 mod day;
+mod dress;
 mod drive;
 mod gnss;
+mod hall;
 mod light;
 mod paint;
 mod path;
@@ -32,6 +34,7 @@ mod random;
 mod render;
 mod scene;
 mod sensor;
+mod survey;
 #[cfg(test)]
 mod tests;
 mod texture;
@@ -39,14 +42,13 @@ mod town;
 mod traffic;
 
 pub use camera::{Camera, CameraError};
-pub use day::Day;
+pub use day::{Day, Season};
 pub use drive::{Drive, DriveSettings, Pose};
 pub use gnss::{Outages, Receiver, ReceiverSample, ReceiverSettings};
 pub use render::Renderer;
 
 use std::{ops::RangeInclusive, sync::Arc};
 
-use corridor::Lamp;
 use path::Corner;
 use scene::{Block, Plane, Upright};
 use texture::{Color, Texture};
@@ -66,6 +68,10 @@ pub struct World {
     ground: Plane,
     ceiling: Option<Plane>,
     lamps: Vec<Lamp>,
+    /// Textures of window panes, which are as bright as the day outside.
+    panes: Vec<u16>,
+    /// Textures of trees, which change with the season.
+    trees: Vec<u16>,
     parking: Vec<Parking>,
 }
 
@@ -73,6 +79,14 @@ pub struct World {
 enum WorldKind {
     Town(Streets),
     Corridor { length_m: f64 },
+    Hall,
+}
+
+/// A rectangle on the ceiling that shines.
+#[derive(Debug, Clone, Copy)]
+struct Lamp {
+    center_m: [f32; 2],
+    half_m: [f32; 2],
 }
 
 /// Where a car may be parked.
@@ -107,6 +121,11 @@ impl World {
         corridor::build(seed, length_m.max(*Self::CORRIDOR_LENGTHS_M.start()).min(*Self::CORRIDOR_LENGTHS_M.end()))
     }
 
+    /// A hall of 44 × 38 m between whose stands, shelves and columns there are aisles.
+    pub fn hall(seed: u64) -> Self {
+        hall::build(seed)
+    }
+
     /// The same place somewhere else on the Earth.
     pub fn with_origin(self, origin: Geodetic) -> Self {
         Self { origin, ..self }
@@ -126,6 +145,8 @@ impl World {
             ground,
             ceiling: None,
             lamps: Vec::new(),
+            panes: Vec::new(),
+            trees: Vec::new(),
             parking: Vec::new(),
         }
     }
@@ -134,6 +155,7 @@ impl World {
         match &self.kind {
             WorldKind::Town(streets) => streets.route(laps, town::LANE_M + lane_shift_m),
             WorldKind::Corridor { length_m } => corridor::route(*length_m, lane_shift_m),
+            WorldKind::Hall => hall::route(lane_shift_m),
         }
     }
 

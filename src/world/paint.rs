@@ -273,6 +273,8 @@ impl HouseStyle {
     }
 }
 
+pub(super) const BARK: Color = rgb(74, 60, 48);
+
 /// The crown and trunk of a tree, in a square of `size_m`.
 pub(super) fn tree(random: &mut ChaCha8Rng, size_m: f32) -> Texture {
     let seed: u32 = random.random();
@@ -281,7 +283,7 @@ pub(super) fn tree(random: &mut ChaCha8Rng, size_m: f32) -> Texture {
     let slim = random.random_range(0.7..1.0);
     let mut canvas = Canvas::new(size_m, size_m, 12.0, CLEAR);
     let middle_m = 0.5 * size_m;
-    canvas.rect([middle_m - 0.14, 0.0], [0.28, 0.5 * size_m], rgb(74, 60, 48));
+    canvas.rect([middle_m - 0.14, 0.0], [0.28, 0.5 * size_m], BARK);
     canvas.fill(|x, y, before| {
         let (dx, dy) = ((x - middle_m) / (0.42 * size_m * slim), (y - 0.62 * size_m) / (0.34 * size_m));
         let edge = 1.15 - 0.75 * fractal(x * 1.6, y * 1.6, seed);

@@ -20,6 +20,9 @@ pub(super) enum Stream {
     Path,
     Receiver,
     Outages,
+    Dress,
+    Gain,
+    Mount,
 }
 
 pub(super) fn stream(seed: u64, stream: Stream) -> ChaCha8Rng {

@@ -8,6 +8,7 @@ use super::{
     Camera, Day, Pose, World,
     camera::CameraError,
     column::{Above, Column, Ray, Rows, Scene},
+    dress::dress,
     light::{BlockLight, Light, Shadows, Sky, ground, lamplight},
     scene::{Block, Plane, Upright},
     sensor::Sensor,
@@ -70,6 +71,7 @@ impl Renderer {
     pub fn new(world: &World, day: &Day, camera: &Camera) -> Result<Self, CameraError> {
         camera.check()?;
         let mut textures = world.textures.iter().map(Arc::clone).collect();
+        dress(world, day, &mut textures);
         let traffic = Traffic::new(world, day, &mut textures);
         let mut blocks = world.blocks.clone();
         blocks.extend(traffic.parked(world, day));

@@ -3,9 +3,9 @@
 use std::f64::consts::{PI, TAU};
 
 use super::{
-    Camera, Day, Drive, DriveSettings, Pose, Renderer, World, WorldKind,
+    Camera, Day, Drive, DriveSettings, Pose, Renderer, Season, World, WorldKind,
     render::{PANORAMA_COLUMNS, PANORAMA_ROWS},
-    scene::{Block, Plane},
+    scene::{Block, Plane, Upright},
     texture::rgb,
 };
 use crate::{
@@ -65,7 +65,7 @@ fn the_same_seeds_give_the_same_bytes_whatever_was_rendered_before() {
 
 #[test]
 fn another_seed_is_another_place() {
-    for build in [World::town_block, World::corridor] {
+    for build in [World::town_block, World::corridor, World::hall] {
         let panorama =
             |seed| renderer(&build(seed), &Day::deserted(1), &clean()).render_panorama(&Pose::at([1.8, 1.4], 0.0), 0.0);
         let difference = mean_difference(&panorama(1), &panorama(2));
@@ -108,6 +108,46 @@ fn another_day_is_another_picture_of_the_same_place() {
     let best = (-20..=20).max_by(|&s, &t| at(s).total_cmp(&at(t))).expect("there are shifts");
     assert_eq!(best, 0, "{} there, {} in place", at(best), at(0));
     assert!(at(0) > 0.8, "{}", at(0));
+}
+
+#[test]
+fn a_season_changes_the_trees_and_nothing_else_of_the_place() {
+    let world = World::town_block(1);
+    let day = Day { overcast: 1.0, ..Day::deserted(1) };
+    // Across the street from a tree.
+    let beside = |tree: &&Upright| world.trees.contains(&tree.texture) && tree.center_m[0].abs() < 8.0;
+    let [_, y_m] = world.uprights.iter().find(beside).expect("the street has a tree").center_m;
+    let pose = Pose::at([0.0, y_m.into()], 0.0);
+    let at =
+        |world: &World, season| renderer(world, &Day { season, ..day.clone() }, &clean()).render_panorama(&pose, 0.0);
+    let summer = at(&world, Season::Summer);
+    let without_trees = World { trees: Vec::new(), ..world.clone() };
+    for season in [Season::Winter, Season::Spring, Season::Autumn] {
+        let difference = mean_difference(&at(&world, season), &summer);
+        assert!((0.2..20.0).contains(&difference), "{season:?}: {difference}");
+        assert_eq!(at(&without_trees, season), summer, "{season:?}");
+    }
+}
+
+#[test]
+fn daylight_changes_the_windows_of_a_hall() {
+    let world = World::hall(1);
+    // Of the same day: with its own daylight, and with panes that have none.
+    let day = Day::deserted(3);
+    let at = |world: &World| renderer(world, &day, &clean()).render_panorama(&Pose::at([6.3, 12.7], 0.3), 0.0);
+    let (daylight, painted) = (at(&world), at(&World { panes: Vec::new(), ..world.clone() }));
+    assert_ne!(daylight, painted);
+    let below = |image: &LumaImage| image.pixels[PANORAMA_COLUMNS * PANORAMA_ROWS * 5 / 9..].to_vec();
+    assert_eq!(below(&daylight), below(&painted), "windows are high up");
+}
+
+#[test]
+fn a_lens_is_mounted_as_askew_as_asked() {
+    let tilted = clean().tilted(0.02, 5);
+    assert_eq!(tilted, clean().tilted(0.02, 5));
+    assert_ne!(tilted.pitch_rad, tilted.roll_rad);
+    assert!(tilted.pitch_rad.abs().max(tilted.roll_rad.abs()) <= 0.04, "{tilted:?}");
+    assert_eq!(clean().tilted(0.0, 5), clean());
 }
 
 #[test]
@@ -230,7 +270,11 @@ fn near_places_look_more_alike_than_far_ones() {
 
 #[test]
 fn calibrating_finds_the_donut() {
-    for (world, camera) in [(World::town_block(2), Camera::town()), (World::corridor(2), Camera::corridor())] {
+    for (world, camera) in [
+        (World::town_block(2), Camera::town()),
+        (World::corridor(2), Camera::corridor()),
+        (World::hall(2), Camera::hall()),
+    ] {
         let drive = Drive::new(&world, &DriveSettings::default());
         let mut renderer = renderer(&world, &Day::new(3), &camera);
         let mut finder = DonutFinder::new(1280, 720).expect("large enough");

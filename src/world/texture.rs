@@ -76,6 +76,13 @@ impl Texture {
         &mut self.levels[0]
     }
 
+    /// With another colour for every texel: `color(column, row, before)`.
+    pub fn recolored(&self, color: impl Fn(usize, usize, Color) -> Color) -> Self {
+        let Level { columns, rows, texels } = &self.levels[0];
+        let texels = texels.iter().enumerate().map(|(i, &before)| color(i / rows, i % rows, before)).collect();
+        Self::new(*columns, *rows, texels, self.texels_per_m)
+    }
+
     /// Makes the coarser levels anew after the finest was changed.
     pub fn refilter(mut self) -> Self {
         self.levels.truncate(1);

@@ -127,6 +127,7 @@ pub(super) fn build(seed: u64) -> World {
             (world.add_texture(tree(&mut random, size_m)), size_m)
         })
         .collect();
+    world.trees = trees.iter().map(|&(texture, _)| texture).collect();
     for row in kerbs(&streets) {
         furnish(&mut world, &row, &trees, &mut random);
     }

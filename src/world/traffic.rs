@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use super::{
     Day, World, WorldKind,
     corridor::DRIVEN_WIDTH_M,
+    hall,
     paint::{PERSON_M, bright, car_body, car_cabin, car_end, person, pick},
     path::{Corner, Path, Smoothing},
     random::{Stream, stream},
@@ -114,7 +115,7 @@ impl Traffic {
         let mut random = stream(day.seed, Stream::Traffic);
         let looks: Vec<CarLook> = match world.kind {
             WorldKind::Town(_) => (0..CAR_LOOKS).map(|_| CarLook::random(textures, &mut random)).collect(),
-            WorldKind::Corridor { .. } => Vec::new(),
+            WorldKind::Corridor { .. } | WorldKind::Hall => Vec::new(),
         };
         let paths: Vec<Path> = match &world.kind {
             WorldKind::Town(streets) => [(LANE_M, 9.0), (-LANE_M, 6.0), (WALK_M, 2.0), (-WALK_M, 2.0)]
@@ -124,6 +125,7 @@ impl Traffic {
                 let (near_m, far_m) = (0.0, DRIVEN_WIDTH_M);
                 vec![path(&[[0.0, near_m], [*length_m, near_m], [*length_m, far_m], [0.0, far_m]], 0.5)]
             }
+            WorldKind::Hall => vec![through(&hall::route(0.0))],
         };
         let mut cars = Vec::new();
         if world.is_outdoors() {
@@ -143,8 +145,11 @@ impl Traffic {
         let mut random = stream(day.seed, Stream::People);
         let people: Vec<u16> = (0..PERSON_LOOKS).map(|_| add(textures, person(&mut random))).collect();
         let walks = if world.is_outdoors() { 2..4 } else { 0..1 };
-        // Four people in a short corridor are a crowd.
-        let count = if world.is_outdoors() { day.people } else { day.people.div_ceil(8) };
+        let count = match world.kind {
+            WorldKind::Town(_) | WorldKind::Hall => day.people,
+            // Four people in a short corridor are a crowd.
+            WorldKind::Corridor { .. } => day.people.div_ceil(8),
+        };
         let walkers = (0..count)
             .map(|_| {
                 let path = random.random_range(walks.clone());
@@ -211,7 +216,11 @@ fn far(a: [f32; 2], b: [f32; 2], than_m: f32) -> bool {
 
 fn path(corners: &[[f64; 2]], radius_m: f64) -> Path {
     let corners: Vec<Corner> = corners.iter().map(|&at_m| Corner { at_m, radius_m }).collect();
+    through(&corners)
+}
+
+fn through(corners: &[Corner]) -> Path {
     let smoothing =
         Smoothing { spacing_m: 0.1, reach_m: 0.3, wander_m: 0.0, wander_length_m: 1.0, wander_phase_rad: 0.0 };
-    Path::closed(&corners, smoothing)
+    Path::closed(corners, smoothing)
 }
