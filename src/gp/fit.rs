@@ -220,7 +220,7 @@ const SAME_PLACE_M: f64 = 1e-6;
 
 /// Median over the positions of the distance to the nearest position elsewhere in the same recording \[m\]: several images
 /// of one place count as one place. Zero where all positions of a recording are one.
-pub(super) fn median_neighbour_spacing_m(positions: &[PositionM], recording: &[usize]) -> f64 {
+pub(crate) fn median_neighbour_spacing_m(positions: &[PositionM], recording: &[usize]) -> f64 {
     let mut nearest: Vec<f64> = positions
         .iter()
         .zip(recording)
@@ -332,6 +332,16 @@ mod tests {
         let bounded = Bounds { min_length_scale_m: 1.5, ..Bounds::PAPER };
         let fit = &fit_each(&learning, noise.as_ref(), &bounded, || {})[0];
         assert!(!fit.warnings.contains(&Warning::LengthScaleBelowSpacing), "{fit:?}");
+    }
+
+    #[test]
+    fn more_recordings_shrink_the_spacing_only_so_far() {
+        let lane = |shift_m: f64| (0..20).map(move |i| [2.0 * f64::from(i), shift_m]);
+        let spacing_m = |shift_m: f64| {
+            let recording: Vec<usize> = (0..40).map(|i| i / 20).collect();
+            LearningPositions::of_recordings(lane(0.0).chain(lane(shift_m)).collect(), &recording).spacing_m()
+        };
+        assert_eq!([0.1, 0.8, 5.0].map(spacing_m), [0.5, 0.8, 2.0]);
     }
 
     #[test]

@@ -28,7 +28,7 @@ pub use views::Similarity;
 
 use super::survey::Survey;
 use crate::features::Descriptor;
-use crate::gp::LearningPositions;
+use crate::gp::fit::median_neighbour_spacing_m;
 use crate::map::{NotATrack, Recipe, TrackReport};
 use crate::types::{PositionM, distance_m};
 use views::Passes;
@@ -97,7 +97,7 @@ impl TrackSmoother {
             tracks.push(RecordingTrack { rows, track });
         }
         let positions_m: Vec<PositionM> = points.iter().map(|point| point.position_m).collect();
-        let spacing_m = LearningPositions::of_recordings(positions_m.clone(), recording).spacing_m();
+        let spacing_m = median_neighbour_spacing_m(&positions_m, recording);
         Self { positions_m, recording: recording.to_vec(), tracks, spacing_m }
     }
 
