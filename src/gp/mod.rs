@@ -29,16 +29,34 @@ pub enum GpError {
 #[derive(Debug, Clone)]
 pub struct LearningPositions {
     positions: Vec<PositionM>,
+    /// Number of the recording each position is from.
+    recordings: Vec<usize>,
     /// (s_i − s_j)² on either axis, n × n \[m²\].
     squared_distance_m2: [Mat<f64>; 2],
 }
 
 impl LearningPositions {
+    /// Positions of one recording.
     pub fn new(positions: Vec<PositionM>) -> Self {
+        let recordings = vec![0; positions.len()];
+        Self::of_recordings(positions, &recordings)
+    }
+
+    /// Positions with the number of the recording each is from.
+    ///
+    /// # Panics
+    /// When there are more of one than of the other.
+    pub fn of_recordings(positions: Vec<PositionM>, recordings: &[usize]) -> Self {
+        assert_eq!(positions.len(), recordings.len(), "one recording a position");
         let n = positions.len();
         let squared_distance_m2 =
             [0, 1].map(|axis| Mat::from_fn(n, n, |i, j| (positions[i][axis] - positions[j][axis]).powi(2)));
-        Self { positions, squared_distance_m2 }
+        Self { positions, recordings: recordings.to_vec(), squared_distance_m2 }
+    }
+
+    /// Number of the recording each position is from.
+    pub fn recordings(&self) -> &[usize] {
+        &self.recordings
     }
 
     pub fn len(&self) -> usize {

@@ -24,7 +24,7 @@ use super::{CandidateCells, FeatureMap, MapGroup, MapInfo};
 use crate::features::scaling::Scaling;
 
 /// What this build writes, and the only one it reads.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 const METADATA_KEY: &str = "omniloc";
 const CHECKSUM: &str = "sha256";
 

@@ -10,12 +10,14 @@ pub mod perturbation;
 mod split;
 mod subset;
 mod survey;
+mod temperature;
 mod trial;
 
 pub use group::{LearnError, LearnedGroup};
 pub use split::{Split, SplitError};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
+pub use temperature::covers;
 pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
 
 use crate::gp::LearningPositions;
@@ -25,6 +27,7 @@ use crate::map::{
     ValidationFigures,
 };
 use crate::metrics::{ErrorFigures, component_median};
+use crate::types::{PositionM, distance_m};
 
 /// Choices of a training run.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -77,13 +80,14 @@ pub fn train(
         })
     });
     let validation = validation.collect();
+    let temperature = temperature_between_recordings(survey, &trial)?.or(outcomes.temperature).unwrap_or(1.0);
 
-    let learning = LearningPositions::new(positions_m);
+    let everything: Vec<usize> = (0..survey.len()).collect();
+    let learning = LearningPositions::of_recordings(positions_m, &survey.recordings_of(&everything));
     let near_m = NEAR_SPACINGS * median_neighbour_spacing_m(learning.positions());
     let within_m = settings.within_m.unwrap_or(near_m.max(2.0 * settings.grid_step_m));
     let cells = CandidateCells::around(learning.positions(), settings.grid_step_m, Some(within_m))?;
     let centers_m = cells.centers_m();
-    let everything: Vec<usize> = (0..survey.len()).collect();
     let (mut infos, mut groups) = (Vec::new(), Vec::new());
     for selected in outcomes.groups.into_iter().filter(|group| group.features() > 0) {
         let descriptor = selected.recipe.descriptor;
@@ -129,7 +133,38 @@ pub fn train(
         image_size_px: survey.image_size_px.into(),
         grid: cells.grid,
         groups: infos,
+        temperature,
         validation,
     };
     Ok(FeatureMap { info, positions_m: learning.positions().to_vec(), cells, groups })
+}
+
+/// Recordings that are held back in turn to learn the temperature: each costs a training.
+const MAX_HELD_BACK: usize = 3;
+
+/// The temperature of `trial` on whole recordings that were held back: the geometric mean over them. `None` for a single
+/// recording, and where recordings do not see the same places.
+///
+/// What another day adds to the errors no frames of the same day can show.
+fn temperature_between_recordings(survey: &Survey, trial: &Trial) -> Result<Option<f64>, TrialError> {
+    let everything: Vec<usize> = (0..survey.len()).collect();
+    let recordings = survey.recordings_of(&everything);
+    let count = recordings.last().map_or(0, |last| last + 1);
+    let mut logs = Vec::new();
+    for held_back in (0..count).take(if count > 1 { MAX_HELD_BACK } else { 0 }) {
+        let of_others = |row: &usize| recordings[*row] != held_back;
+        let learning: Vec<usize> = everything.iter().copied().filter(of_others).collect();
+        let at = |row: usize| trial.recorded_m[row];
+        let others_m: Vec<PositionM> = learning.iter().map(|&row| at(row)).collect();
+        let near_m = median_neighbour_spacing_m(&others_m).max(trial.grid_step_m);
+        let seen = |&row: &usize| !of_others(&row) && others_m.iter().any(|&p| distance_m(p, at(row)) <= near_m);
+        let validation: Vec<usize> = everything.iter().copied().filter(seen).collect();
+        if validation.is_empty() {
+            continue;
+        }
+        let split = Split { learning, validation, test: Vec::new() };
+        let outcomes = run(survey, &Trial { split: &split, ..trial.clone() }, |_| {})?;
+        logs.extend(outcomes.temperature.map(f64::ln));
+    }
+    Ok((!logs.is_empty()).then(|| (logs.iter().sum::<f64>() / logs.len() as f64).exp()))
 }

@@ -215,6 +215,11 @@ impl Survey {
         self.frames.iter().map(|frame| frame.position_m).collect()
     }
 
+    /// Numbers of the recordings that the frames at `rows` are from.
+    pub fn recordings_of(&self, rows: &[usize]) -> Vec<usize> {
+        rows.iter().map(|&row| self.frames[row].recording).collect()
+    }
+
     /// Properties of the frames at `rows`, n × d.
     ///
     /// # Panics
