@@ -157,6 +157,11 @@ def kernel(squared, length_m, name):
     return np.exp(-0.5 * squared / length_m**2)
 
 
+# How much of eq. 10's log variance an unknown scale of the residuals is charged. None is left when the residuals are
+# divided by the variance too.
+NOT_KNOWING = {"unknown-scale": 0.5, "fully charged": 1.0, "scaled-variance": 0.0}
+
+
 class Group:
     """src/train/noise_whitening.rs and the Gaussian processes of the features it finds, on the cells."""
 
@@ -193,8 +198,7 @@ class Group:
         square = square.clip(1e-9)
         if self.noise == "gaussian":
             return -0.5 * square / self.variance - 0.5 * k * np.log(self.variance)
-        log_variance = 0 if self.noise == "scaled-variance" else np.log(self.variance)
-        return -0.5 * k * (np.log(square) + log_variance)
+        return -0.5 * k * (np.log(square) + NOT_KNOWING[self.noise] * np.log(self.variance))
 
 
 def locate(log_likelihood, cells, columns, step_m):
@@ -213,11 +217,12 @@ def locate(log_likelihood, cells, columns, step_m):
     return np.array(found)
 
 
-ROW = dict(signatures=DEFAULT, harmonics=None, bands=slice(None), features=96, length=1.3, kernel="gaussian",
+ROW = dict(signatures=DEFAULT, harmonics=None, bands=slice(None), features=96, length=1.5, kernel="gaussian",
            perturbations=True, noise="unknown-scale")
 TABLE = {
     "default": {},
     "residual divided by the variance": dict(noise="scaled-variance"),
+    "all of eq. 10's log variance": dict(noise="fully charged"),
     "eq. 10": dict(noise="gaussian"),
     "no perturbations": dict(perturbations=False),
     **{f"{name} alone": dict(signatures=(name,)) for name in SIGNATURES},

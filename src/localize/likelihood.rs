@@ -108,11 +108,11 @@ impl FieldOnCells {
         }
         let count = self.features as f32;
         for ((out, residual), normalizer) in log_likelihood.iter_mut().zip(&*scratch).zip(&self.log_normalizer) {
-            let fit = match noise {
-                NoiseModel::Gaussian => *residual,
-                NoiseModel::UnknownScale => count * residual.max(f32::MIN_POSITIVE).ln(),
-            };
-            *out += weight * (normalizer - 0.5 * fit);
+            *out += weight
+                * match noise {
+                    NoiseModel::Gaussian => normalizer - 0.5 * residual,
+                    NoiseModel::UnknownScale => 0.5 * normalizer - 0.5 * count * residual.max(f32::MIN_POSITIVE).ln(),
+                };
         }
     }
 
@@ -210,7 +210,7 @@ mod tests {
                 .fold(f32::NEG_INFINITY, f32::max)
         };
         let log_variance = [0.5_f32 * 0.1, 1.0 * 0.2, 2.0 * 0.4].map(|product| 0.5 * product.ln());
-        let expected = |cell: usize| best(cell) - log_variance[cell];
+        let expected = |cell: usize| best(cell) - 0.5 * log_variance[cell];
         let constant = profile[0] - expected(0);
         for (cell, profile) in profile.iter().enumerate() {
             assert!((profile - expected(cell) - constant).abs() < 1e-3, "{cell}");
@@ -220,7 +220,7 @@ mod tests {
     /// A frame that resembles no place much is not sent where the map knows nothing and predicts the mean of all places.
     #[test]
     fn an_unknown_cell_must_fit_better_than_a_known_one() {
-        let field = FieldOnCells::new(2, 2, vec![1.0, 0.0, 1.0, 0.0], &[1.1, 3.0]);
+        let field = FieldOnCells::new(2, 2, vec![1.0, 0.0, 1.0, 0.0], &[1.1, 9.0]);
         let (mut known_and_unknown, mut scratch) = (vec![0.0; 2], Vec::new());
         let faint = [0.4, 0.4];
         field.add_log_likelihood(&faint, NoiseModel::UnknownScale, 1.0, &mut scratch, &mut known_and_unknown);

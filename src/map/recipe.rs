@@ -58,9 +58,10 @@ pub struct Recipe {
 pub enum NoiseModel {
     /// −½ Σ (d_i²/p_i + log p_i + log 2π): Do et al. (2015), eqs. 10 and 11.
     Gaussian,
-    /// −k/2 log Σ d_i² − ½ Σ log p_i. The first term is noise of one unknown scale a frame, at its most likely value:
+    /// −k/2 log Σ d_i² − ¼ Σ log p_i. The first term is noise of one unknown scale a frame, at its most likely value:
     /// light and traffic change a frame's residuals together, and a frame that fits nowhere well is not trusted k times
-    /// over. The second is what eq. 10 charges for not knowing. Dividing d_i² by p_i as well would cancel it; then
+    /// over. The second is half of what eq. 10 charges for not knowing (all of it pulls frames between sparse images to the
+    /// next one; see benches/ablation). Dividing d_i² by p_i as well would cancel it; then
     /// frames of another day, whose features are fainter, are sent to cells off the survey's path, where the predicted
     /// mean is faint too.
     UnknownScale,
@@ -130,7 +131,7 @@ impl Recipe {
 
     fn default_over(descriptors: &[Descriptor]) -> Self {
         let model =
-            Model::SharedField(NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.3, ridge: 0.05 });
+            Model::SharedField(NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.5, ridge: 0.05 });
         let group = |&descriptor| GroupRecipe { descriptor, model, noise: NoiseModel::UnknownScale, weight: 1.0 };
         Self {
             name: RecipeName::Default,

@@ -4,6 +4,8 @@
 //! is sharper than the errors are. Divided by the *temperature* T it is as sharp as frames that were held back show:
 //! p(cell) ∝ exp(log-likelihood / T).
 
+use rayon::prelude::*;
+
 use crate::localize::most_likely_cell;
 use crate::map::CandidateCells;
 use crate::types::{PositionM, distance_m};
@@ -20,12 +22,19 @@ pub fn fit_temperature(cells: &CandidateCells, log_likelihoods: &[&[f32]], truth
         return None;
     }
     let centers_m = cells.centers_m();
-    let true_cells: Vec<usize> = truth_m.iter().map(|&truth_m| nearest_cell(&centers_m, truth_m)).collect();
-    let cost = |temperature: f64| -> f64 {
-        log_likelihoods.iter().zip(&true_cells).map(|(row, &at)| surprise(row, at, temperature)).sum()
-    };
-    let tried = LOG2_QUARTERS.map(|quarters| 2.0_f64.powf(0.25 * f64::from(quarters)));
-    tried.map(|temperature| (temperature, cost(temperature))).min_by(|a, b| a.1.total_cmp(&b.1)).map(|best| best.0)
+    let tried: Vec<f64> = LOG2_QUARTERS.map(|quarters| 2.0_f64.powf(0.25 * f64::from(quarters))).collect();
+    // Frame × temperature; summed in order, so that the same frames always give the same temperature.
+    let surprises: Vec<Vec<f64>> = log_likelihoods
+        .par_iter()
+        .zip(truth_m)
+        .map(|(row, &truth_m)| {
+            let at = nearest_cell(&centers_m, truth_m);
+            tried.iter().map(|&temperature| surprise(row, at, temperature)).collect()
+        })
+        .collect();
+    let cost = |i: usize| surprises.iter().map(|of_frame| of_frame[i]).sum::<f64>();
+    let best = (0..tried.len()).min_by(|&a, &b| cost(a).total_cmp(&cost(b)));
+    best.map(|best| tried[best])
 }
 
 /// Whether the cell nearest `truth_m` lies in the smallest region that holds `probability` at this temperature.
