@@ -60,10 +60,9 @@ pub enum NoiseModel {
     Gaussian,
     /// −k/2 log Σ d_i² − ¼ Σ log p_i. The first term is noise of one unknown scale a frame, at its most likely value:
     /// light and traffic change a frame's residuals together, and a frame that fits nowhere well is not trusted k times
-    /// over. The second is half of what eq. 10 charges for not knowing (all of it pulls frames between sparse images to the
-    /// next one; see benches/ablation). Dividing d_i² by p_i as well would cancel it; then
-    /// frames of another day, whose features are fainter, are sent to cells off the survey's path, where the predicted
-    /// mean is faint too.
+    /// over. The second is half of what eq. 10 charges for not knowing. With all of it, frames in the gaps of a survey are
+    /// drawn to the next image; with none (which is what dividing d_i² by p_i as well leaves), frames of another day,
+    /// whose features are fainter, are sent to cells off the survey's path, where the predicted mean is faint too.
     UnknownScale,
 }
 
