@@ -234,7 +234,7 @@ fn learning(c: &mut Criterion) {
     let learning = LearningPositions::new(positions);
     let mut random = ChaCha8Rng::seed_from_u64(2);
     let changes = Mat::from_fn(2 * LEARNING, properties.ncols(), |_, _| random.random_range(-0.3..0.3));
-    let settings = NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.75, ridge: 0.05 };
+    let settings = NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.5, ridge: 0.05 };
     let mut group = c.benchmark_group("train");
     group.sample_size(10);
     group.bench_function("noise whitening, gradient, n = 189", |b| {

@@ -146,6 +146,12 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
         };
         progress.finish();
         print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
+        if let Some(covered) = entries.iter().find_map(|entry| entry.coverage_95) {
+            print(&format!(
+                "The region that the map gives 95 % holds the true position in {:.1} % of the frames.\n",
+                100.0 * covered
+            ))?;
+        }
         all.extend(entries);
     }
     print(&format!("\n{LEGEND}"))?;
@@ -185,7 +191,7 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
         ..Entry::default()
     };
     let know_nothing_m = component_median(&map.positions_m);
-    let mut entries: Vec<Entry> = against_map(&survey, &map)
+    let mut entries: Vec<Entry> = against_map(&survey, &map, &truth_m)
         .into_iter()
         .map(|outcome| {
             let entry = Entry {
@@ -195,6 +201,7 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
                 rank: Some(outcome.rank),
                 kept: Some(outcome.kept),
                 compression: compression(outcome.m, outcome.kept),
+                coverage_95: outcome.coverage_95,
                 ..base.clone()
             };
             let entry = entry.with_figures(ErrorFigures::of(&outcome.estimates_m, &truth_m, know_nothing_m));

@@ -43,6 +43,10 @@ pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {
             (rows - 1.0) * info.grid.step_m
         ),
     ));
+    lines.push((
+        "temperature",
+        format!("{:.1}: divides log-likelihoods before they are probabilities", info.temperature),
+    ));
     let donut = &info.calibration;
     lines.push((
         "lens",

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::localize::FieldOnCells;
 use crate::map::FeatureMap;
-use crate::train::{Survey, locate};
+use crate::train::{Survey, covers, locate};
 use crate::types::PositionM;
 
 /// Single-frame estimates from one group of the map, or from all of them fused.
@@ -15,10 +15,14 @@ pub struct MapOutcome {
     pub rank: usize,
     pub kept: usize,
     pub estimates_m: Vec<PositionM>,
+    /// Share of frames whose true position lies in the region that holds 95 % of the probability, at the map's
+    /// temperature; `None` for a group that is only a part of the answer.
+    pub coverage_95: Option<f64>,
 }
 
-/// Estimates for every frame of `survey`: one outcome a group, and one of all groups fused if there are several.
-pub fn against_map(survey: &Survey, map: &FeatureMap) -> Vec<MapOutcome> {
+/// Estimates for every frame of `survey`, which in truth are at `truth_m`: one outcome a group, and one of all groups
+/// fused if there are several.
+pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> Vec<MapOutcome> {
     let fields: Vec<FieldOnCells> = map.groups.iter().map(FieldOnCells::of).collect();
     let rows: Vec<usize> = (0..survey.len()).collect();
     let features: Vec<_> = map
@@ -30,7 +34,7 @@ pub fn against_map(survey: &Survey, map: &FeatureMap) -> Vec<MapOutcome> {
         .collect();
 
     // Per frame: an estimate a group, and the fused one last.
-    let estimates_m: Vec<Vec<PositionM>> = rows
+    let (estimates_m, covered): (Vec<Vec<PositionM>>, Vec<bool>) = rows
         .par_iter()
         .map_init(Vec::new, |scratch, &row| {
             let mut fused = vec![0.0; map.cells.len()];
@@ -47,9 +51,10 @@ pub fn against_map(survey: &Survey, map: &FeatureMap) -> Vec<MapOutcome> {
                 })
                 .collect();
             of_frame.push(locate(&map.cells, &fused, map.info.refine));
-            of_frame
+            (of_frame, covers(&map.cells, &fused, truth_m[row], map.info.temperature, 0.95))
         })
-        .collect();
+        .unzip();
+    let covered = covered.iter().filter(|&&covered| covered).count() as f64 / survey.len().max(1) as f64;
 
     let column = |i: usize| estimates_m.iter().map(|of_frame| of_frame[i]).collect();
     let mut outcomes: Vec<MapOutcome> = map
@@ -63,6 +68,7 @@ pub fn against_map(survey: &Survey, map: &FeatureMap) -> Vec<MapOutcome> {
             rank: group.rank,
             kept: group.features,
             estimates_m: column(i),
+            coverage_95: (fields.len() == 1).then_some(covered),
         })
         .collect();
     if outcomes.len() > 1 {
@@ -73,6 +79,7 @@ pub fn against_map(survey: &Survey, map: &FeatureMap) -> Vec<MapOutcome> {
             rank: total(|outcome| outcome.rank),
             kept: total(|outcome| outcome.kept),
             estimates_m: column(outcomes.len()),
+            coverage_95: Some(covered),
         });
     }
     outcomes

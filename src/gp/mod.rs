@@ -29,6 +29,8 @@ pub enum GpError {
 #[derive(Debug, Clone)]
 pub struct LearningPositions {
     positions: Vec<PositionM>,
+    /// Number of the recording each position is from.
+    recordings: Vec<usize>,
     /// (s_i − s_j)² on either axis, n × n \[m²\].
     squared_distance_m2: [Mat<f64>; 2],
     spacing_m: f64,
@@ -42,24 +44,34 @@ const LEAST_SPACING_SHARE: f64 = 0.25;
 impl LearningPositions {
     /// Positions of one recording.
     pub fn new(positions: Vec<PositionM>) -> Self {
-        let recording = vec![0; positions.len()];
-        Self::of_recordings(positions, &recording)
+        let recordings = vec![0; positions.len()];
+        Self::of_recordings(positions, &recordings)
     }
 
     /// Positions with the number of the recording each is from.
-    pub fn of_recordings(positions: Vec<PositionM>, recording: &[usize]) -> Self {
+    ///
+    /// # Panics
+    /// When there are more of one than of the other.
+    pub fn of_recordings(positions: Vec<PositionM>, recordings: &[usize]) -> Self {
+        assert_eq!(positions.len(), recordings.len(), "one recording a position");
         let n = positions.len();
         let pooled_m = fit::median_neighbour_spacing_m(&positions, &vec![0; n]);
-        let spacing_m = pooled_m.max(LEAST_SPACING_SHARE * fit::median_neighbour_spacing_m(&positions, recording));
+        let spacing_m = pooled_m.max(LEAST_SPACING_SHARE * fit::median_neighbour_spacing_m(&positions, recordings));
         let squared_distance_m2 =
             [0, 1].map(|axis| Mat::from_fn(n, n, |i, j| (positions[i][axis] - positions[j][axis]).powi(2)));
-        Self { positions, squared_distance_m2, spacing_m }
+        Self { positions, recordings: recordings.to_vec(), squared_distance_m2, spacing_m }
     }
 
     /// Some of the positions, with the spacing of all.
     pub fn of_rows(&self, rows: &[usize]) -> Self {
         let positions = rows.iter().map(|&row| self.positions[row]).collect();
-        Self { spacing_m: self.spacing_m, ..Self::new(positions) }
+        let recordings: Vec<usize> = rows.iter().map(|&row| self.recordings[row]).collect();
+        Self { spacing_m: self.spacing_m, ..Self::of_recordings(positions, &recordings) }
+    }
+
+    /// Number of the recording each position is from.
+    pub fn recordings(&self) -> &[usize] {
+        &self.recordings
     }
 
     pub fn len(&self) -> usize {

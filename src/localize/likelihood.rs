@@ -94,23 +94,25 @@ impl FieldOnCells {
         assert_eq!((features.len(), log_likelihood.len()), (self.features, self.cells), "features and cells");
         scratch.clear();
         scratch.resize(self.cells, 0.0);
-        if self.precision.len() == self.cells {
-            for (feature, &z) in features.iter().enumerate() {
-                add_squared_distance(z, self.mean_of(feature), scratch);
+        let shared = self.precision.len() == self.cells;
+        for (feature, &z) in features.iter().enumerate() {
+            match noise {
+                NoiseModel::Gaussian if !shared => {
+                    add_residual(z, self.mean_of(feature), self.precision_of(feature), scratch);
+                }
+                _ => add_squared_distance(z, self.mean_of(feature), scratch),
             }
+        }
+        if shared && noise == NoiseModel::Gaussian {
             scratch.iter_mut().zip(&self.precision).for_each(|(residual, precision)| *residual *= precision);
-        } else {
-            for (feature, &z) in features.iter().enumerate() {
-                add_residual(z, self.mean_of(feature), self.precision_of(feature), scratch);
-            }
         }
         let count = self.features as f32;
         for ((out, residual), normalizer) in log_likelihood.iter_mut().zip(&*scratch).zip(&self.log_normalizer) {
-            let fit = match noise {
-                NoiseModel::Gaussian => *residual,
-                NoiseModel::UnknownScale => count * residual.max(f32::MIN_POSITIVE).ln(),
-            };
-            *out += weight * (normalizer - 0.5 * fit);
+            *out += weight
+                * match noise {
+                    NoiseModel::Gaussian => normalizer - 0.5 * residual,
+                    NoiseModel::UnknownScale => 0.5 * normalizer - 0.5 * count * residual.max(f32::MIN_POSITIVE).ln(),
+                };
         }
     }
 
@@ -192,26 +194,36 @@ mod tests {
         }
     }
 
-    /// The unknown scale is the Gaussian likelihood at its best factor on the variances, up to a constant.
+    /// Whatever the map knows of a cell, the frame's own noise is at its most likely scale there.
     #[test]
-    fn unknown_scale_is_the_profile_of_the_gaussian() {
+    fn unknown_scale_is_the_profile_of_noise_of_the_frame_and_the_map_s_log_variance() {
         let features = [0.3_f32, -0.7];
         let (mut profile, mut scratch) = (vec![0.0; 3], Vec::new());
         field().add_log_likelihood(&features, NoiseModel::UnknownScale, 1.0, &mut scratch, &mut profile);
+        let unit = |scale: f32| FieldOnCells::new(2, 3, vec![0.0, 1.0, 2.0, -1.0, 0.5, 0.25], &[scale; 3]);
         let best = |cell: usize| {
-            let factors = (1..4000).map(|i| 0.005 * i as f32);
-            factors
-                .map(|factor| {
-                    let variance: Vec<f32> = [0.5, 1.0, 2.0, 0.1, 0.2, 0.4].map(|p: f32| p * factor).to_vec();
-                    let scaled = FieldOnCells::new(2, 3, vec![0.0, 1.0, 2.0, -1.0, 0.5, 0.25], &variance);
-                    let each = scaled.log_likelihood_of_each(&features);
+            (1..4000)
+                .map(|i| {
+                    let each = unit(0.005 * i as f32).log_likelihood_of_each(&features);
                     each[cell] + each[3 + cell]
                 })
                 .fold(f32::NEG_INFINITY, f32::max)
         };
-        let constant = profile[0] - best(0);
+        let log_variance = [0.5_f32 * 0.1, 1.0 * 0.2, 2.0 * 0.4].map(|product| 0.5 * product.ln());
+        let expected = |cell: usize| best(cell) - 0.5 * log_variance[cell];
+        let constant = profile[0] - expected(0);
         for (cell, profile) in profile.iter().enumerate() {
-            assert!((profile - best(cell) - constant).abs() < 1e-3, "{cell}");
+            assert!((profile - expected(cell) - constant).abs() < 1e-3, "{cell}");
         }
+    }
+
+    /// A frame that resembles no place much is not sent where the map knows nothing and predicts the mean of all places.
+    #[test]
+    fn an_unknown_cell_must_fit_better_than_a_known_one() {
+        let field = FieldOnCells::new(2, 2, vec![1.0, 0.0, 1.0, 0.0], &[1.1, 9.0]);
+        let (mut known_and_unknown, mut scratch) = (vec![0.0; 2], Vec::new());
+        let faint = [0.4, 0.4];
+        field.add_log_likelihood(&faint, NoiseModel::UnknownScale, 1.0, &mut scratch, &mut known_and_unknown);
+        assert!(known_and_unknown[0] > known_and_unknown[1], "{known_and_unknown:?}");
     }
 }

@@ -24,7 +24,7 @@ use super::{CandidateCells, FeatureMap, MapGroup, MapInfo};
 use crate::features::scaling::Scaling;
 
 /// What this build writes, and the only one it reads.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 const METADATA_KEY: &str = "omniloc";
 const CHECKSUM: &str = "sha256";
 
@@ -293,7 +293,7 @@ mod tests {
         let mut map = small_map();
         map.info.format_version = 7;
         let error = from_bytes(&to_bytes(&map)).expect_err("newer");
-        assert_eq!(error.to_string(), "map file is version 7, this build reads version 1: install a newer omniloc");
+        assert_eq!(error.to_string(), "map file is version 7, this build reads version 2: install a newer omniloc");
     }
 
     #[test]

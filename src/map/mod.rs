@@ -66,6 +66,9 @@ pub struct MapInfo {
     pub image_size_px: [usize; 2],
     pub grid: Grid,
     pub groups: Vec<GroupInfo>,
+    /// p(cell) ∝ exp(log-likelihood / temperature): learned from frames that were held back, whole recordings of them
+    /// where there are several.
+    pub temperature: f64,
     /// Errors on frames that the choices were made on but that nothing was fitted to.
     pub validation: Vec<ValidationFigures>,
 }
@@ -128,6 +131,9 @@ impl MapInfo {
         }
         if self.groups.is_empty() || self.recordings.is_empty() {
             return Err("it has no groups of features, or no recordings".into());
+        }
+        if !(1e-3..=1e6).contains(&self.temperature) {
+            return Err(format!("temperature {:e}", self.temperature));
         }
         for (i, group) in self.groups.iter().enumerate() {
             let name = group.recipe.descriptor;
@@ -231,6 +237,7 @@ pub(crate) mod tests {
                     features: 2,
                     hyperparameters: GroupHyperparameters::Shared(hyperparameters),
                 }],
+                temperature: 4.0,
                 validation: Vec::new(),
             },
             groups: vec![MapGroup {

@@ -51,15 +51,18 @@ pub struct Recipe {
     pub refit: bool,
 }
 
-/// How the residuals of a group of features add up to a log-likelihood. With r_i = (z_i − μ_i)² / p_i, where
-/// p_i = σ_e² + v_i is the predictive variance:
+/// How the residuals d_i = z_i − μ_i of a group of k features add up to a log-likelihood, with the predictive variances
+/// p_i = σ_e² + v_i:
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum NoiseModel {
-    /// −½ Σ (r_i + log p_i + log 2π): Do et al. (2015), eqs. 10 and 11.
+    /// −½ Σ (d_i²/p_i + log p_i + log 2π): Do et al. (2015), eqs. 10 and 11.
     Gaussian,
-    /// −k/2 log Σ r_i − ½ Σ log p_i: one unknown factor on all the variances of a frame, at its most likely value. Light
-    /// and traffic change a frame's residuals together; a frame that fits nowhere well is not trusted k times over.
+    /// −k/2 log Σ d_i² − ¼ Σ log p_i. The first term is noise of one unknown scale a frame, at its most likely value:
+    /// light and traffic change a frame's residuals together, and a frame that fits nowhere well is not trusted k times
+    /// over. The second is half of what eq. 10 charges for not knowing. With all of it, frames in the gaps of a survey are
+    /// drawn to the next image; with none (which is what dividing d_i² by p_i as well leaves), frames of another day,
+    /// whose features are fainter, are sent to cells off the survey's path, where the predicted mean is faint too.
     UnknownScale,
 }
 
@@ -127,7 +130,7 @@ impl Recipe {
 
     fn default_over(descriptors: &[Descriptor]) -> Self {
         let model =
-            Model::SharedField(NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.75, ridge: 0.05 });
+            Model::SharedField(NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.5, ridge: 0.05 });
         let group = |&descriptor| GroupRecipe { descriptor, model, noise: NoiseModel::UnknownScale, weight: 1.0 };
         Self {
             name: RecipeName::Default,

@@ -10,6 +10,7 @@ pub mod perturbation;
 mod split;
 mod subset;
 mod survey;
+mod temperature;
 mod track;
 mod trial;
 
@@ -17,6 +18,7 @@ pub use group::{LearnError, LearnedGroup};
 pub use split::{Split, SplitError};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
+pub use temperature::covers;
 pub use track::{Similarity, Smoothed, TrackSmoother};
 pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
 
@@ -26,6 +28,7 @@ use crate::map::{
     TrackReport, TrainedOn, ValidationFigures,
 };
 use crate::metrics::{ErrorFigures, component_median};
+use crate::types::{PositionM, distance_m};
 
 /// Choices of a training run.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,9 +48,9 @@ pub const NEAR_SPACINGS: f64 = 7.0;
 /// Makes a map of all frames of `survey`: Algorithm 1 of Do et al. (2015).
 ///
 /// A quarter of the frames is first held back to choose features and to measure on. The map itself is then of all
-/// frames, at positions that `settings.smoothing` made of those recorded: a recipe without selection learns again from all;
-/// after a selection, the scaling and hyperparameters that it
-/// was made with are kept and the Gaussian processes conditioned on all frames. `sources` names the recordings.
+/// frames, at positions that `settings.smoothing` made of those recorded: a recipe without selection learns again from
+/// all; after a selection, the scaling and hyperparameters that it was made with are kept and the Gaussian processes
+/// conditioned on all frames. `sources` names the recordings.
 pub fn train(
     survey: &Survey,
     sources: &[String],
@@ -86,6 +89,7 @@ pub fn train(
         })
     });
     let validation = validation.collect();
+    let temperature = temperature_between_recordings(survey, &trial)?.or(outcomes.temperature).unwrap_or(1.0);
 
     let everything: Vec<usize> = (0..survey.len()).collect();
     let smoothed = smoothed(&everything);
@@ -145,7 +149,38 @@ pub fn train(
         image_size_px: survey.image_size_px.into(),
         grid: cells.grid,
         groups: infos,
+        temperature,
         validation,
     };
     Ok(FeatureMap { info, positions_m: learning.positions().to_vec(), cells, groups })
+}
+
+/// Recordings that are held back in turn to learn the temperature: each costs a training.
+const MAX_HELD_BACK: usize = 3;
+
+/// The temperature of `trial` on whole recordings that were held back: the geometric mean over them. `None` for a single
+/// recording, and where recordings do not see the same places.
+///
+/// What another day adds to the errors no frames of the same day can show.
+fn temperature_between_recordings(survey: &Survey, trial: &Trial) -> Result<Option<f64>, TrialError> {
+    let everything: Vec<usize> = (0..survey.len()).collect();
+    let recordings = survey.recordings_of(&everything);
+    let count = recordings.last().map_or(0, |last| last + 1);
+    let mut logs = Vec::new();
+    for held_back in (0..count).take(if count > 1 { MAX_HELD_BACK } else { 0 }) {
+        let of_others = |row: &usize| recordings[*row] != held_back;
+        let learning: Vec<usize> = everything.iter().copied().filter(of_others).collect();
+        let at = |row: usize| trial.recorded_m[row];
+        let others_m: Vec<PositionM> = learning.iter().map(|&row| at(row)).collect();
+        let near_m = LearningPositions::new(others_m.clone()).spacing_m().max(trial.grid_step_m);
+        let seen = |&row: &usize| !of_others(&row) && others_m.iter().any(|&p| distance_m(p, at(row)) <= near_m);
+        let validation: Vec<usize> = everything.iter().copied().filter(seen).collect();
+        if validation.is_empty() {
+            continue;
+        }
+        let split = Split { learning, validation, test: Vec::new() };
+        let outcomes = run(survey, &Trial { split: &split, ..trial.clone() }, |_| {})?;
+        logs.extend(outcomes.temperature.map(f64::ln));
+    }
+    Ok((!logs.is_empty()).then(|| (logs.iter().sum::<f64>() / logs.len() as f64).exp()))
 }

@@ -9,9 +9,11 @@ use faer::linalg::solvers::Svd;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{Mat, MatRef, Par, Side};
 
+use super::group::LearnError;
 use crate::features::scaling::{Scaling, ScalingError};
-use crate::gp::{Hyperparameters, LearningPositions};
+use crate::gp::{GpError, Hyperparameters, LearningPositions, Posterior};
 use crate::map::NoiseWhiteningSettings;
+use crate::types::distance_m;
 
 /// What is learned: the scaling, and one set of hyperparameters for all features.
 #[derive(Debug, Clone)]
@@ -31,21 +33,23 @@ const LOG2_NOISE_RATIOS: std::ops::RangeInclusive<i32> = -20..=5;
 /// 1. Y = mean + P D Vᵀ (thin SVD); Z = P D, n × r.
 /// 2. A Gaussian process with length scale ℓ = `length_scale_spacings` × the median spacing and noise ratio q for all
 ///    directions; q minimises the squared leave-one-out error |E|², E_i = \[R⁻¹Z\]_i / \[R⁻¹\]_ii.
-/// 3. Noise covariance C = EᵀE/n + (ΔV)ᵀ(ΔV)/p + ridge · mean eigenvalue · I.
+/// 3. Noise covariance C = EᵀE/n + (ΔV)ᵀ(ΔV)/p + ridge · mean eigenvalue · I. Where a place was recorded several times,
+///    E holds in place of the leave-one-out errors those of every recording under the Gaussian process of the others:
+///    what another day changes, measured.
 /// 4. Generalised eigenvectors g of ZᵀZ/n g = λ C g with gᵀ C g = 1, largest λ first; features z = gᵀ Vᵀ (y − mean).
 /// 5. The predictive variance is scaled to 1 on average over the learning positions, as step 3 has it.
 ///
 /// # Errors
-/// As [`Scaling::learn`].
+/// As [`Scaling::learn`], and when a kernel matrix is not positive definite in floating point.
 pub fn learn(
     settings: &NoiseWhiteningSettings,
     learning: &LearningPositions,
     properties: MatRef<f64>,
     changes: MatRef<f64>,
-) -> Result<NoiseWhitening, ScalingError> {
+) -> Result<NoiseWhitening, LearnError> {
     let (n, d) = (properties.nrows(), properties.ncols());
     if n < 2 {
-        return Err(ScalingError::TooFewImages { rows: n });
+        return Err(ScalingError::TooFewImages { rows: n }.into());
     }
     let mean: Vec<f64> = (0..d).map(|k| properties.col(k).iter().sum::<f64>() / n as f64).collect();
     let centered = Mat::from_fn(n, d, |i, k| properties[(i, k)] - mean[k]);
@@ -54,7 +58,7 @@ pub fn learn(
     let largest = singular.first().copied().unwrap_or(0.0);
     let rank = singular.iter().take_while(|&&s| s > NULL_SINGULAR_RATIO * largest).count();
     if rank == 0 {
-        return Err(ScalingError::NoVariance { rows: n });
+        return Err(ScalingError::NoVariance { rows: n }.into());
     }
     let basis = svd.V().subcols(0, rank);
     let z = Mat::from_fn(n, rank, |i, r| svd.U()[(i, r)] * singular[r]);
@@ -63,7 +67,9 @@ pub fn learn(
     let unit = Hyperparameters { signal_std: 1.0, noise_std: 0.0, length_scale_m: [length_m; 2] };
     let loo = leave_one_out(learning, z.as_ref(), &unit);
 
-    let mut noise = loo.residual.transpose() * &loo.residual * (1.0 / n as f64);
+    let between = between_recordings(learning, z.as_ref(), &unit, loo.noise_ratio)?;
+    let residual = between.as_ref().unwrap_or(&loo.residual);
+    let mut noise = residual.transpose() * residual * (1.0 / residual.nrows() as f64);
     if changes.nrows() > 0 {
         let projected = changes * basis;
         noise += projected.transpose() * &projected * (1.0 / changes.nrows() as f64);
@@ -83,6 +89,44 @@ pub fn learn(
         length_scale_m: [length_m; 2],
     };
     Ok(NoiseWhitening { scaling: Scaling { mean, projection }, hyperparameters })
+}
+
+/// Fewer frames than this at places that several recordings saw say nothing about the change between them.
+const MIN_SEEN_AGAIN: usize = 32;
+
+/// Residuals of `z`, n × r, at positions within a length scale of another recording's, under the Gaussian process of all
+/// other recordings: one row each. `None` where recordings hardly meet, or there is only one.
+fn between_recordings(
+    learning: &LearningPositions,
+    z: MatRef<f64>,
+    unit: &Hyperparameters,
+    noise_ratio: f64,
+) -> Result<Option<Mat<f64>>, GpError> {
+    let (positions, recordings) = (learning.positions(), learning.recordings());
+    let hyperparameters = Hyperparameters { noise_std: noise_ratio.sqrt(), ..*unit };
+    let mut numbers = recordings.to_vec();
+    numbers.sort_unstable();
+    numbers.dedup();
+    let mut residuals: Vec<Vec<f64>> = Vec::new();
+    for &number in &numbers {
+        let others: Vec<usize> = (0..learning.len()).filter(|&i| recordings[i] != number).collect();
+        let near = |&i: &usize| {
+            recordings[i] == number
+                && others.iter().any(|&j| distance_m(positions[i], positions[j]) <= unit.length_scale_m[0])
+        };
+        let seen_again: Vec<usize> = (0..learning.len()).filter(near).collect();
+        if seen_again.is_empty() {
+            continue;
+        }
+        let elsewhen = LearningPositions::new(others.iter().map(|&j| positions[j]).collect());
+        let observed = Mat::from_fn(others.len(), z.ncols(), |j, r| z[(others[j], r)]);
+        let here: Vec<_> = seen_again.iter().map(|&i| positions[i]).collect();
+        let predicted = Posterior::new(&elsewhen, observed.as_ref(), hyperparameters)?.predict(&here).mean;
+        let row = |(at, &i): (usize, &usize)| (0..z.ncols()).map(|r| z[(i, r)] - predicted[(at, r)]).collect();
+        residuals.extend(seen_again.iter().enumerate().map(row));
+    }
+    let enough = residuals.len() >= MIN_SEEN_AGAIN;
+    Ok(enough.then(|| Mat::from_fn(residuals.len(), z.ncols(), |i, r| residuals[i][r])))
 }
 
 struct LeaveOneOut {
@@ -169,6 +213,32 @@ mod tests {
         let calm = learn(&SETTINGS, &learning, properties.as_ref(), Mat::zeros(0, 4).as_ref()).expect("varies");
         let strength = |scaling: &Scaling, k: usize| (0..2).map(|r| scaling.projection[(r, k)].powi(2)).sum::<f64>();
         assert!(strength(&calm.scaling, 2) > 10.0 * strength(&learned.scaling, 2));
+    }
+
+    /// Property 2 is another on another day; one drive cannot know, two can.
+    #[test]
+    fn what_changed_between_two_recordings_is_trusted_less() {
+        let (_, properties, _) = drive();
+        let positions = || (0..120).map(|i| [f64::from(i / 2), 0.3 * f64::from(i % 2)]).collect();
+        let both = Mat::from_fn(120, 4, |i, k| match (k, i % 2) {
+            (2, 1) => 3.0 * (0.4 * i as f64).sin(),
+            _ => properties[(i / 2, k)],
+        });
+        let day: Vec<usize> = (0..120).map(|i| i % 2).collect();
+        let two = LearningPositions::of_recordings(positions(), &day);
+        let none = Mat::zeros(0, 4);
+        let learned = learn(&SETTINGS, &two, both.as_ref(), none.as_ref()).expect("varies");
+        let first = |k: usize| learned.scaling.projection[(0, k)].abs();
+        assert!(first(0) > 10.0 * first(2), "{:?}", learned.scaling.projection);
+        // Residuals are those under the other recording's Gaussian process, and recordings that never meet have none.
+        let unit = Hyperparameters { signal_std: 1.0, noise_std: 0.0, length_scale_m: [2.0; 2] };
+        let residual = between_recordings(&two, both.as_ref(), &unit, 0.1).expect("positive definite").expect("two");
+        assert_eq!((residual.nrows(), residual.ncols()), (120, 4));
+        let change = |k: usize| residual.col(k).iter().map(|v| v * v).sum::<f64>() / 120.0;
+        assert!(change(2) > 30.0 * change(0), "{} {}", change(2), change(0));
+        let apart: Vec<_> = (0..120).map(|i| [f64::from(i / 2), 90.0 * f64::from(i % 2)]).collect();
+        let apart = LearningPositions::of_recordings(apart, &day);
+        assert!(between_recordings(&apart, both.as_ref(), &unit, 0.1).expect("positive definite").is_none());
     }
 
     #[test]

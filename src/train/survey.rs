@@ -218,7 +218,7 @@ impl Survey {
         self.frames.iter().map(|frame| frame.position_m).collect()
     }
 
-    /// The recordings that the frames at `rows` are from.
+    /// Numbers of the recordings that the frames at `rows` are from.
     pub fn recordings_of(&self, rows: &[usize]) -> Vec<usize> {
         rows.iter().map(|&row| self.frames[row].recording).collect()
     }

@@ -12,6 +12,7 @@ use super::perturbation::standard_normal;
 use super::split::Split;
 use super::subset::{LikelihoodTable, backward_elimination};
 use super::survey::Survey;
+use super::temperature::fit_temperature;
 use crate::gp::fit::Warning;
 use crate::gp::{GpError, LearningPositions};
 use crate::localize::{FieldOnCells, most_likely_cell, refined_m};
@@ -39,6 +40,9 @@ pub struct Outcomes {
     pub groups: Vec<LearnedGroup>,
     /// Number of frames they were learned from in the end.
     pub learned_from: usize,
+    /// What the fused log-likelihood of the validation frames, none of which was learned from, has to be divided by to be
+    /// as sharp as their errors; `None` with too few of them.
+    pub temperature: Option<f64>,
 }
 
 /// What a trial brought for one row of the table: a group, or all of them fused.
@@ -130,7 +134,7 @@ pub fn run(survey: &Survey, trial: &Trial, on_step: impl Fn(Step) + Sync) -> Res
     for (row, before) in refitted.rows.iter_mut().zip(first.rows) {
         row.kept_validation_m = before.kept_validation_m;
     }
-    Ok(refitted)
+    Ok(Outcomes { temperature: first.temperature, ..refitted })
 }
 
 fn run_once(
@@ -211,6 +215,10 @@ fn run_once(
         groups.push(kept_group);
         on_step(Step::Done);
     }
+    let temperature = fused.as_ref().and_then(|[_, _, kept_validation]| {
+        let rows: Vec<&[f32]> = kept_validation.values.chunks_exact(kept_validation.cells).collect();
+        fit_temperature(&cells, &rows, &queries.validation_m)
+    });
     if let (Some([all_test, kept_test, kept_validation]), true) = (fused, outcomes.len() > 1) {
         let total = |of: fn(&Outcome) -> usize| -> usize { outcomes.iter().map(of).sum() };
         let sum = |of: fn(&Outcome) -> Option<f64>| outcomes.iter().map(of).sum();
@@ -227,7 +235,7 @@ fn run_once(
             warnings: BTreeMap::new(),
         });
     }
-    Ok(Outcomes { rows: outcomes, groups, learned_from: learning.len() })
+    Ok(Outcomes { rows: outcomes, groups, learned_from: learning.len(), temperature })
 }
 
 /// −2 Σ L(θ_r) + 4 |Ω| log n: the reading of the Bayesian information criterion that fits the paper's tables, four
