@@ -111,16 +111,12 @@ mod tests {
         let mut first: Vec<usize> = (0..n).map(|i: usize| i.saturating_sub(2)).collect();
         (first[17], first[n - 1]) = (2, 0);
         let mut dense = vec![vec![0.0; n]; n];
-        let mut skyline = Skyline::zeros(first.clone());
-        for i in 0..n {
-            for j in first[i]..=i {
-                let linked = i - j < 3 || (i, j) == (17, 2) || i == n - 1;
-                let value = if i == j { 9.0 } else { ((3 * i + j) as f64).sin() };
-                if linked {
-                    skyline.add(j, i, value);
-                    (dense[i][j], dense[j][i]) = (value, value);
-                }
-            }
+        let mut skyline = Skyline::zeros(first);
+        let links = (0..n).flat_map(|i| (0..=i).map(move |j| (i, j)));
+        for (i, j) in links.filter(|&(i, j)| i - j < 3 || (i, j) == (17, 2) || i == n - 1) {
+            let value = if i == j { 9.0 } else { ((3 * i + j) as f64).sin() };
+            skyline.add(j, i, value);
+            (dense[i][j], dense[j][i]) = (value, value);
         }
         (skyline, dense)
     }

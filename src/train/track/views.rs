@@ -223,9 +223,9 @@ impl View {
         let mut equation =
             Equation { terms: Vec::with_capacity(6), right: 0.0, variance: self.std_m.powi(2), has_outliers: true };
         for (frame, factor) in [(self.frame, 1.0), (before, self.share - 1.0), (after, -self.share)] {
-            for axis in 0..2 {
-                equation.terms.push((first_unknown[frame] + axis, factor * self.along[axis]));
-                equation.right += factor * self.along[axis] * positions_m[frame][axis];
+            for (axis, (along, received_m)) in self.along.iter().zip(positions_m[frame]).enumerate() {
+                equation.terms.push((first_unknown[frame] + axis, factor * along));
+                equation.right += factor * along * received_m;
             }
         }
         equation
