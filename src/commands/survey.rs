@@ -67,7 +67,9 @@ fn refuse_copies(recordings: &[Recording]) -> Result<(), BadArgument> {
         recording.survey.iter().map(|frame| (frame.stamp_ns, frame.position_m)).collect()
     };
     for (i, recording) in recordings.iter().enumerate() {
-        let is_copy = |earlier: &&Recording| earlier.name == recording.name && frames(earlier) == frames(recording);
+        let is_copy = |earlier: &&Recording| {
+            earlier.calibration_json() == recording.calibration_json() && frames(earlier) == frames(recording)
+        };
         if let Some(first) = recordings[..i].iter().find(is_copy) {
             let (copy, first) = (recording.path.display(), first.path.display());
             return Err(BadArgument(format!("{copy} holds the same frames as {first}: name it once")));

@@ -304,7 +304,7 @@ fn utc(item: &mut Reader) -> Result<Option<(i64, bool)>, &'static str> {
     let year = i64::from(item.u16()?);
     let [month, day, hour, minute, second, flags] = item.array()?.map(i64::from);
     let is_time = ns < SECONDS_TO_NS && hour < 24 && minute < 60 && second <= 60;
-    let days = days_since_1970(year, month, day).filter(|_| is_time && year < 2200);
+    let days = days_since_1970(year, month, day).filter(|_| is_time && (1970..2200).contains(&year));
     let since_midnight_ns = ((hour * 60 + minute) * 60 + second) * SECONDS_TO_NS + ns;
     Ok(days.map(|days| (days * NS_PER_DAY + since_midnight_ns, flags & 4 != 0)))
 }
