@@ -124,8 +124,8 @@ class SiftVlad:
 
 # Chosen with `days --tune`.
 PEERS = {
-    "aligned": Aligned(scale=None),
-    "sift-vlad": SiftVlad(size=(512, 128)),
+    "aligned": Aligned(scale=4),
+    "sift-vlad": SiftVlad((1024, 256), upright=True, contrast=0.04),
 }
 
 CANDIDATES = {
