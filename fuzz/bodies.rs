@@ -11,9 +11,11 @@ use omniloc::{
     types::GnssSample,
 };
 
+pub type Target = fn(&[u8]);
+
 /// All targets by name.
 #[allow(dead_code, reason = "each fuzz target uses one")]
-pub const ALL: [(&str, fn(&[u8])); 5] =
+pub const ALL: [(&str, Target); 5] =
     [("serial", serial), ("jpeg", jpeg), ("recover", recover), ("map", map), ("config", config)];
 
 /// 100 µs a byte, without a remainder.
