@@ -204,11 +204,12 @@ fn line(rows: &[&Entry]) -> String {
 /// What the columns mean, for under the tables.
 pub const LEGEND: &str = "\
 All errors in metres, from the positions as recorded, or from --truth, also where the positions that are learned from
-are corrected. images: what the tested model was learned from; the default recipe chooses nothing on the
-validation frames, so that, once measured on them (BE V), it learns from them too. m properties, rank after scaling, kept by the selection (m / kept). RMSE: all T with all features on
-the test frames; BE V and BE T with the features kept, on validation and test frames; e_max the largest test error.
-Right of the bar, the estimate the recipe stands for. skill: 1 - RMSE / RMSE of always answering the median position;
-1 is perfect, 0 knows nothing. Where features are chosen, BE V is of the frames they were chosen on: it flatters.
+are corrected. images: what the tested model was learned from; the default recipe chooses nothing on the validation
+frames, so that, once measured on them (BE V), it learns from them too. m properties, rank after scaling, kept by the
+selection (m / kept). RMSE: all T with all features on the test frames; BE V and BE T with the features kept, on
+validation and test frames; e_max the largest test error. Right of the bar, the estimate the recipe stands for. skill:
+1 - RMSE / RMSE of always answering the median position; 1 is perfect, 0 knows nothing. Where features are chosen, BE V
+is of the frames they were chosen on: it flatters.
 ";
 
 #[cfg(test)]
