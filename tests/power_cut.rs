@@ -107,7 +107,8 @@ fn cut_once(seed: u64) {
 
 #[test]
 fn a_power_cut_costs_at_most_the_last_second() {
-    for seed in 0..rounds(300) {
+    // The first once left a mended copy behind that nobody came back to.
+    for seed in [6952].into_iter().chain(0..rounds(300)) {
         cut_once(seed);
     }
 }

@@ -27,11 +27,13 @@ pub enum Mended {
     Unreadable,
 }
 
-/// Cut segments in the folder, oldest first.
+/// Cut segments in the folder, oldest first; also those of which only the copy is left that a mending made.
 pub fn cut_segments(storage: &dyn Storage) -> io::Result<Vec<SegmentName>> {
     let parsed = storage.list()?.into_iter().filter_map(|file| SegmentName::parse(&file.name));
-    let mut names: Vec<_> = parsed.filter(|(_, part)| *part == Part::Open).map(|(name, _)| name).collect();
+    let is_cut = |part: Part| matches!(part, Part::Open | Part::Mending);
+    let mut names: Vec<_> = parsed.filter(|(_, part)| is_cut(*part)).map(|(name, _)| name).collect();
     names.sort();
+    names.dedup();
     Ok(names)
 }
 
@@ -47,17 +49,22 @@ pub fn mend(
     let [open, finished, mending] = [Part::Open, Part::Finished, Part::Mending].map(|part| name.file(part));
     if is_whole(storage, &finished)? {
         // The power went after the mended copy had got its name.
-        remove(storage, &open)?;
+        remove_if_there(storage, &open)?;
+        remove_if_there(storage, &mending)?;
         return Ok(Mended::WasWhole);
     }
     if is_whole(storage, &open)? {
         rename(storage, &open, &finished)?;
+        remove_if_there(storage, &mending)?;
         return Ok(Mended::WasWhole);
     }
-    match storage.remove(&mending) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-        _ => {}
+    if !is_there(storage, &open)? {
+        // Not by us: the segment goes after its copy has got its name.
+        let is_whole = is_whole(storage, &mending)?;
+        rename(storage, &mending, &if is_whole { finished } else { name.file(Part::Damaged) })?;
+        return Ok(if is_whole { Mended::WasWhole } else { Mended::Unreadable });
     }
+    remove_if_there(storage, &mending)?;
     let input = storage.open(&open)?;
     let (mut out, _) = Appender::new(storage.create(&mending)?);
     let outcome = recover::recover(input, &mut out, before_read).map_err(|error| match error {
@@ -68,7 +75,7 @@ pub fn mend(
     })?;
     drop(out);
     if recovery.messages == 0 {
-        storage.remove(&mending)?;
+        remove(storage, &mending)?;
         if recovery.lost_bytes == recovery.zero_bytes {
             remove(storage, &open)?;
             return Ok(Mended::WasEmpty);
@@ -94,6 +101,20 @@ fn rename(storage: &dyn Storage, from: &str, to: &str) -> io::Result<()> {
 fn remove(storage: &dyn Storage, name: &str) -> io::Result<()> {
     storage.remove(name)?;
     storage.sync_folder()
+}
+
+fn remove_if_there(storage: &dyn Storage, name: &str) -> io::Result<()> {
+    match remove(storage, name) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+fn is_there(storage: &dyn Storage, name: &str) -> io::Result<bool> {
+    match storage.open(name) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        outcome => outcome.map(|_| true),
+    }
 }
 
 /// Whether a file is there and complete. A look at its end spares reading one that is not.
