@@ -1,6 +1,7 @@
 //! Words every folder may use. Nothing here uses anything else of ours.
 
 mod calibration;
+mod estimate;
 mod geodesy;
 mod geometry;
 mod gnss;
@@ -9,6 +10,9 @@ mod pool;
 mod time;
 
 pub use calibration::{AzimuthSense, CalibrationError, DonutCalibration, LensKind};
+pub use estimate::{
+    EstimateWarnings, EstimatedHeading, EstimatedPose, LocalizationState, PositionCovariance, PositionEstimate,
+};
 pub use geodesy::{Geodetic, LocalFrame};
 pub use geometry::{PositionM, distance_m, wrap_angle_rad};
 pub use gnss::{Fix, FixQuality, GnssSample, Heading, North, SampleTime, TimeScale};
