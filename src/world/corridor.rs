@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     Lamp, World, WorldKind,
-    paint::{Canvas, bright, pick},
+    paint::{Canvas, board, bright, pick},
     path::Corner,
     random::{Stream, fractal, stream, white},
     scene::{Block, Plane, Upright},
@@ -133,7 +133,7 @@ fn wall(width_m: f32, paint: Color, dado: Option<Color>, random: &mut ChaCha8Rng
             }
             3..6 => {
                 let size_m = [random.random_range(0.3_f32..1.1).min(left_m), random.random_range(0.4..0.9)];
-                poster(&mut canvas, [at_m, random.random_range(1.0..1.5)], size_m, random);
+                board(&mut canvas, [at_m, random.random_range(1.0..1.5)], size_m, 0.03, random);
                 size_m[0] + 0.1
             }
             6 => {
@@ -145,18 +145,6 @@ fn wall(width_m: f32, paint: Color, dado: Option<Color>, random: &mut ChaCha8Rng
         } + random.random_range(0.1..0.9);
     }
     canvas.into_texture()
-}
-
-fn poster(canvas: &mut Canvas, [left_m, bottom_m]: [f32; 2], [width_m, height_m]: [f32; 2], random: &mut ChaCha8Rng) {
-    let (frame, paper) = (tinted(bright(random), 0.6), bright(random));
-    canvas.rect([left_m, bottom_m], [width_m, height_m], frame);
-    canvas.rect([left_m + 0.03, bottom_m + 0.03], [width_m - 0.06, height_m - 0.06], paper);
-    for _ in 0..random.random_range(2..7) {
-        let part = [random.random_range(0.1..0.6), random.random_range(0.08..0.4)];
-        let at = [random.random_range(0.05..0.9 - part[0]), random.random_range(0.05..0.9 - part[1])];
-        let corner = [left_m + at[0] * width_m, bottom_m + at[1] * height_m];
-        canvas.rect(corner, [part[0] * width_m, part[1] * height_m], bright(random));
-    }
 }
 
 /// Cupboards, benches, bins and plants along the walls.

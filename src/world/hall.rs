@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     Lamp, World, WorldKind,
-    paint::{Canvas, bright, pick},
+    paint::{Canvas, board, bright, pick},
     path::Corner,
     random::{Stream, fractal, stream, white},
     scene::{Block, Plane, Upright},
@@ -16,6 +16,7 @@ use crate::types::PositionM;
 /// From wall to wall, east and north \[m\].
 pub(super) const SIZE_M: [f64; 2] = [44.0, 38.0];
 const HEIGHT_M: f32 = 5.5;
+const BOARD_FRAME_M: f32 = 0.05;
 /// Aisles run between squares of this many rows and columns; one thing or none stands in each.
 const SQUARES: [usize; 2] = [7, 6];
 /// What stands in a square is at most this long: the rest is aisle \[m\].
@@ -195,7 +196,7 @@ fn wall(width_m: f32, paint: Color, random: &mut ChaCha8Rng) -> Texture {
             }
             1..4 => {
                 let size_m = [random.random_range(0.7_f32..2.8), random.random_range(0.6..1.4)];
-                board(&mut canvas, [at_m, random.random_range(0.8..1.6)], size_m, random);
+                board(&mut canvas, [at_m, random.random_range(0.8..1.6)], size_m, BOARD_FRAME_M, random);
                 size_m[0]
             }
             4 => {
@@ -206,18 +207,6 @@ fn wall(width_m: f32, paint: Color, random: &mut ChaCha8Rng) -> Texture {
         } + random.random_range(0.3..2.5);
     }
     canvas.into_texture()
-}
-
-/// A picture or a notice: a frame, a ground, and shapes on it.
-fn board(canvas: &mut Canvas, [left_m, bottom_m]: [f32; 2], [width_m, height_m]: [f32; 2], random: &mut ChaCha8Rng) {
-    canvas.rect([left_m, bottom_m], [width_m, height_m], tinted(bright(random), 0.6));
-    canvas.rect([left_m + 0.05, bottom_m + 0.05], [width_m - 0.1, height_m - 0.1], bright(random));
-    for _ in 0..random.random_range(2..7) {
-        let part = [random.random_range(0.1..0.6), random.random_range(0.08..0.4)];
-        let at = [random.random_range(0.05..0.9 - part[0]), random.random_range(0.05..0.9 - part[1])];
-        let corner = [left_m + at[0] * width_m, bottom_m + at[1] * height_m];
-        canvas.rect(corner, [part[0] * width_m, part[1] * height_m], bright(random));
-    }
 }
 
 /// Beside every other crossing of the aisles.
@@ -295,13 +284,13 @@ fn stand(world: &mut World, square: Square, random: &mut ChaCha8Rng) {
     for _ in 0..random.random_range(1..4) {
         let size_m = [random.random_range(0.5..1.2), random.random_range(0.5..1.0)];
         let at_m = [random.random_range(0.1..long_m - size_m[0] - 0.1), random.random_range(0.5..top_m - size_m[1])];
-        board(&mut canvas, at_m, size_m, random);
+        board(&mut canvas, at_m, size_m, BOARD_FRAME_M, random);
     }
     let (front, flank) = (world.add_texture(canvas.into_texture()), world.add_plain(tinted(color, 0.7)));
     world.blocks.push(square.block([0.0, 1.2], [long_m, 0.12], [0.0, top_m], [flank, front], color));
     let counter_m = random.random_range(1.0..long_m);
     let mut canvas = Canvas::new(counter_m, 1.0, TEXELS_PER_M, tinted(color, 0.85));
-    board(&mut canvas, [0.1, 0.15], [counter_m - 0.2, 0.7], random);
+    board(&mut canvas, [0.1, 0.15], [counter_m - 0.2, 0.7], BOARD_FRAME_M, random);
     let front = world.add_texture(canvas.into_texture());
     let along_m = 0.5 * (long_m - counter_m) * pick(random, &[-1.0, 0.0, 1.0]);
     let counter = square.block([along_m, -0.7], [counter_m, 0.6], [0.0, 1.0], [flank, front], rgb(200, 196, 188));

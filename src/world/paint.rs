@@ -273,6 +273,25 @@ impl HouseStyle {
     }
 }
 
+/// A picture or a notice: a frame of this width, a ground, and shapes on it.
+pub(super) fn board(
+    canvas: &mut Canvas,
+    [left_m, bottom_m]: [f32; 2],
+    [width_m, height_m]: [f32; 2],
+    frame_m: f32,
+    random: &mut ChaCha8Rng,
+) {
+    canvas.rect([left_m, bottom_m], [width_m, height_m], tinted(bright(random), 0.6));
+    let inner_m = [width_m - 2.0 * frame_m, height_m - 2.0 * frame_m];
+    canvas.rect([left_m + frame_m, bottom_m + frame_m], inner_m, bright(random));
+    for _ in 0..random.random_range(2..7) {
+        let part = [random.random_range(0.1..0.6), random.random_range(0.08..0.4)];
+        let at = [random.random_range(0.05..0.9 - part[0]), random.random_range(0.05..0.9 - part[1])];
+        let corner = [left_m + at[0] * width_m, bottom_m + at[1] * height_m];
+        canvas.rect(corner, [part[0] * width_m, part[1] * height_m], bright(random));
+    }
+}
+
 pub(super) const BARK: Color = rgb(74, 60, 48);
 
 /// The crown and trunk of a tree, in a square of `size_m`.
