@@ -4,44 +4,16 @@
 
 mod common;
 
-use std::{
-    collections::BTreeMap,
-    fs,
-    path::{Path, PathBuf},
-    process::Command,
-    sync::OnceLock,
-    thread,
-    time::Duration,
-};
+use std::{collections::BTreeMap, fs, path::Path, thread, time::Duration};
 
 use common::{
     drive::{command, configure, finished, health, messages, stderr, wait},
-    omniloc,
+    omniloc, shim,
 };
 use omniloc::recording::{
     proto::{foxglove, omniloc as proto},
     topics,
 };
-
-/// Compiles the library once.
-fn shim() -> &'static Path {
-    static SHIM: OnceLock<PathBuf> = OnceLock::new();
-    SHIM.get_or_init(|| {
-        let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join("disk_shim.so");
-        // Another run of this program may be using the library: a new one is put in its place whole.
-        let compiling = library.with_extension(std::process::id().to_string());
-        let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/disk_shim/shim.c");
-        let compiled = Command::new("cc")
-            .args(["-shared", "-fPIC", "-O1", "-Wall", "-Wextra", "-Werror", "-o"])
-            .args([compiling.as_path(), Path::new(source)])
-            .arg("-ldl")
-            .status()
-            .expect("cc runs");
-        assert!(compiled.success());
-        fs::rename(&compiling, &library).expect("renames");
-        library
-    })
-}
 
 /// Bytes in the folder of recordings.
 fn recorded_bytes(folder: &Path) -> u64 {
@@ -59,7 +31,7 @@ fn drive_with(fault: &str, lasts: Duration, duration_s: f64, late_pairs: u64) {
     let config = configure(folder.path(), &format!("duration_s = {duration_s:.1}"), &[]);
     let recordings = folder.path().join("recordings");
     let child = command(&config)
-        .env("LD_PRELOAD", shim())
+        .env("LD_PRELOAD", shim("disk_shim"))
         .env("DISK_FOLDER", &recordings)
         .env("DISK_FAULTS", &faults)
         .spawn()

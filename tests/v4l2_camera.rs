@@ -5,16 +5,18 @@
 
 #![cfg(feature = "vehicle")]
 
+mod common;
+
 use std::{
     cell::RefCell,
     fs,
     io::Write,
     path::{Path, PathBuf},
     process::{Child, Command, Stdio},
-    sync::OnceLock,
     time::{Duration, Instant},
 };
 
+use common::shim;
 use omniloc::{
     devices::{
         CameraEvent, DeviceError, Stop,
@@ -102,26 +104,6 @@ fn describe(error: &DeviceError) -> String {
     format!("{error}{source}")
 }
 
-/// Compiles the library once.
-fn shim() -> &'static Path {
-    static SHIM: OnceLock<PathBuf> = OnceLock::new();
-    SHIM.get_or_init(|| {
-        let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join("v4l2_shim.so");
-        // Another run of this program may be using the library: a new one is put in its place whole.
-        let compiling = library.with_extension(std::process::id().to_string());
-        let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/v4l2_shim/shim.c");
-        let compiled = Command::new("cc")
-            .args(["-shared", "-fPIC", "-O1", "-Wall", "-Wextra", "-Werror", "-o"])
-            .args([compiling.as_path(), Path::new(source)])
-            .args(["-ldl", "-lpthread"])
-            .status()
-            .expect("cc runs");
-        assert!(compiled.success());
-        fs::rename(&compiling, &library).expect("renames");
-        library
-    })
-}
-
 struct Camera {
     folder: TempDir,
     job: Job,
@@ -150,7 +132,7 @@ impl Camera {
     fn start(&self) -> Child {
         let mut command = Command::new(std::env::current_exe().expect("this program"));
         command.args(["--exact", "capture", "--ignored", "--nocapture"]);
-        command.env("LD_PRELOAD", shim()).env(JOB, serde_json::to_string(&self.job).expect("serializes"));
+        command.env("LD_PRELOAD", shim("v4l2_shim")).env(JOB, serde_json::to_string(&self.job).expect("serializes"));
         command.envs(self.environment.iter().cloned()).stdout(Stdio::null()).stdin(Stdio::null());
         command.spawn().expect("starts")
     }

@@ -5,8 +5,10 @@
 pub mod drive;
 
 use std::{
+    collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
+    sync::Mutex,
 };
 
 use assert_cmd::Command;
@@ -15,6 +17,28 @@ use tempfile::TempDir;
 pub const HEADER: &str = "index,file,x_m,y_m,yaw_rad,time_s";
 pub const DONUT: &str = r#"{"kind": "donut", "cx": 47.5, "cy": 47.5, "r_in": 10.0, "r_out": 40.0, "top_is_outer": true,
     "start_angle": 0.0, "clockwise": true, "azimuth": "ccw"}"#;
+
+/// The library `tests/NAME/shim.c`, compiled once a program: preloaded, it plays a device or makes one fail.
+pub fn shim(name: &str) -> PathBuf {
+    static COMPILED: Mutex<BTreeMap<String, PathBuf>> = Mutex::new(BTreeMap::new());
+    let mut compiled = COMPILED.lock().expect("nothing panicked");
+    let compile = || {
+        let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name).with_extension("so");
+        // Another run of this program may be using the library: a new one is put in its place whole.
+        let compiling = library.with_extension(std::process::id().to_string());
+        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests").join(name).join("shim.c");
+        let status = std::process::Command::new("cc")
+            .args(["-shared", "-fPIC", "-O1", "-Wall", "-Wextra", "-Werror", "-o"])
+            .args([&compiling, &source])
+            .args(["-ldl", "-lpthread"])
+            .status()
+            .expect("cc runs");
+        assert!(status.success(), "cc {}", source.display());
+        fs::rename(&compiling, &library).expect("renames");
+        library
+    };
+    compiled.entry(name.into()).or_insert_with(compile).clone()
+}
 
 /// A grey JPEG whose pixels depend on `seed`.
 pub fn jpeg(width_px: u32, height_px: u32, seed: u32) -> Vec<u8> {
