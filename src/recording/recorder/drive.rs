@@ -18,9 +18,11 @@ use tracing::{info, warn};
 
 use super::{
     Settings,
+    abandoned::Abandoned,
     disk::{self, Facts},
     entry::{Entry, Loss},
     guard::{Guard, delete_oldest},
+    marks::{self, Marks},
     open_segment::{LINGER_NS, OpenSegment, PAIR_WAIT_NS},
     queue::Queued,
     segments::{Appender, Head, Part, Segment, SegmentName},
@@ -37,8 +39,6 @@ const LAST_RETRY_NS: u64 = 5 * NS_PER_S;
 const GUARD_INTERVAL_NS: u64 = NS_PER_S / 2;
 /// Unsynced for longer than this: the disk is slow.
 const SLOW_NS: u64 = 2 * NS_PER_S;
-/// A file of this name in the folder asks for the present segment to be marked: `omniloc mark`.
-pub const MARK_REQUEST: &str = "mark.request";
 
 /// Writes one drive.
 pub struct DriveWriter {
@@ -62,12 +62,8 @@ pub struct DriveWriter {
     /// In a row.
     failures: u32,
     guard_at_ns: u64,
-    /// Segments that want to be marked.
-    marks: Vec<SegmentName>,
-    /// Abandoned segments that could not be cut where they were last synced, and where that was.
-    uncut: Vec<(SegmentName, Appender, u64)>,
-    /// Cut segments that nobody has been told of.
-    abandoned: Vec<SegmentName>,
+    marks: Marks,
+    abandoned: Abandoned,
     /// Somebody took away a file that was being written.
     has_vanished: bool,
     facts: Facts,
@@ -115,9 +111,8 @@ impl DriveWriter {
             retry_at_ns: 0,
             failures: 0,
             guard_at_ns: 0,
-            marks: Vec::new(),
-            uncut: Vec::new(),
-            abandoned: Vec::new(),
+            marks: Marks::default(),
+            abandoned: Abandoned::default(),
             has_vanished: false,
             facts: Facts::default(),
         })
@@ -145,10 +140,12 @@ impl DriveWriter {
         if now_ns >= self.guard_at_ns {
             self.guard_at_ns = now_ns + GUARD_INTERVAL_NS;
             self.keep_room();
-            self.cut_abandoned();
-            self.read_mark_request();
+            self.abandoned.cut();
+            if marks::take_request(&*self.storage) {
+                self.mark();
+            }
         }
-        self.write_marks();
+        self.marks.write(&*self.storage);
         self.facts.age(now_ns);
     }
 
@@ -158,13 +155,7 @@ impl DriveWriter {
             Some(current) => current.name.number,
             None => self.next_number,
         };
-        let files = self.storage.list().unwrap_or_default();
-        let names = files.into_iter().filter_map(|file| SegmentName::parse(&file.name));
-        let before =
-            names.filter(|(name, part)| name.number < current && *part != Part::Keep).map(|(name, _)| name).max();
-        self.marks.extend(before);
-        self.marks.push(SegmentName::new(&self.boot_id, current));
-        self.write_marks();
+        self.marks.want(SegmentName::new(&self.boot_id, current), &*self.storage);
     }
 
     /// Syncs and ends what is open. `false`: not all of it is on the disk.
@@ -183,7 +174,7 @@ impl DriveWriter {
                 break;
             }
         }
-        self.cut_abandoned();
+        self.abandoned.cut();
         self.pending() == 0 && self.losses.is_empty() && !self.has_vanished
     }
 
@@ -194,7 +185,7 @@ impl DriveWriter {
 
     /// Segments that were cut off by a failure since the last call: to be mended.
     pub fn take_abandoned(&mut self) -> Vec<SegmentName> {
-        std::mem::take(&mut self.abandoned)
+        self.abandoned.take()
     }
 
     pub(super) fn facts(&self) -> &Facts {
@@ -420,7 +411,7 @@ impl DriveWriter {
                 // Nothing is lost: its entries are synced, and it will be mended; unless somebody took the file away.
                 self.has_vanished |= error.kind() == io::ErrorKind::NotFound;
                 warn!(segment = open, %error, "segment could not be finished");
-                self.abandoned.push(name);
+                self.abandoned.note(name);
             }
         }
     }
@@ -430,8 +421,7 @@ impl DriveWriter {
         self.note_failure(&io_error(error));
         let Some(open) = self.open(which).take() else { return };
         let OpenSegment { name, segment, synced_bytes, unsynced, last_image, .. } = open;
-        self.uncut.push((name, segment.abandon(), synced_bytes));
-        self.cut_abandoned();
+        self.abandoned.give_up(name, segment.abandon(), synced_bytes);
         let first_kept = unsynced.iter().find_map(|queued| match queued.entry {
             Entry::Image { sequence, .. } => Some(sequence),
             _ => None,
@@ -452,18 +442,6 @@ impl DriveWriter {
                 }
             }
         }
-    }
-
-    /// Cuts abandoned segments where they were last synced, so that no message is in two segments.
-    fn cut_abandoned(&mut self) {
-        let abandoned = &mut self.abandoned;
-        self.uncut.retain_mut(|(name, file, synced_bytes)| {
-            let is_cut = file.cut(*synced_bytes).is_ok();
-            if is_cut {
-                abandoned.push(name.clone());
-            }
-            !is_cut
-        });
     }
 
     /// Decides when to try again: at once the first time and when room could be made, then later and later.
@@ -506,27 +484,6 @@ impl DriveWriter {
                 warn!(%error, "no room could be made");
                 false
             }
-        }
-    }
-
-    fn read_mark_request(&mut self) {
-        if self.storage.open(MARK_REQUEST).is_ok() && self.storage.remove(MARK_REQUEST).is_ok() {
-            self.mark();
-        }
-    }
-
-    fn write_marks(&mut self) {
-        let Some(first) = self.marks.first() else { return };
-        let outcome = self.marks.iter().try_for_each(|name| match self.storage.create(&name.file(Part::Keep)) {
-            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => Err(error),
-            _ => Ok(()),
-        });
-        match outcome.and_then(|()| self.storage.sync_folder()) {
-            Ok(()) => {
-                info!(from = first.file(Part::Finished), "segments marked to be kept");
-                self.marks.clear();
-            }
-            Err(error) => warn!(%error, "segments could not be marked yet"),
         }
     }
 

@@ -6,12 +6,15 @@
 //! ```
 //!
 //! Only the writer thread and the mending thread touch the disk. `drive.rs` does the writer's work without a thread,
-//! `segments.rs` writes one segment, `guard.rs` makes room, `mend.rs` mends what a power cut left behind.
+//! `segments.rs` writes one segment, `guard.rs` makes room except of what `marks.rs` keeps, `mend.rs` mends what a power
+//! cut or a failing disk (`abandoned.rs`) left behind.
 
+mod abandoned;
 pub mod disk;
 mod drive;
 mod entry;
 mod guard;
+mod marks;
 mod mend;
 mod open_segment;
 mod queue;
@@ -23,13 +26,14 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-pub use drive::{DriveWriter, MARK_REQUEST};
+pub use drive::DriveWriter;
 pub use entry::{Encoder, Entry, Loss};
+pub use marks::{MARK_REQUEST, request_mark};
 pub use mend::{Mended, cut_segments, mend};
 pub use open_segment::PAIR_WAIT_NS;
 pub use queue::{Queue, Queued};
 pub use segments::{Head, Part, Segment, SegmentName};
-pub use storage::{FileFacts, Folder, ReadSeek, SegmentFile, Space, Storage, request_mark};
+pub use storage::{FileFacts, Folder, ReadSeek, SegmentFile, Space, Storage};
 pub use thread::{Recorder, RecorderHandle, RecorderHealth, RecorderReport};
 
 /// `[recorder]` of the configuration.

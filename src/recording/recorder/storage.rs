@@ -12,8 +12,6 @@ use rustix::{
     io::Errno,
 };
 
-use super::drive::MARK_REQUEST;
-
 /// A file being written. Bytes are only appended.
 pub trait SegmentFile: Write + Send {
     /// Returns when everything written so far is on the disk.
@@ -83,16 +81,6 @@ impl Folder {
             Ok(()) | Err(_) => Ok(Self { path: path.into(), _locked: folder }),
         }
     }
-}
-
-/// Asks the recorder that writes to this folder to keep its present segment. `false`: there is none.
-pub fn request_mark(folder: &Path) -> io::Result<bool> {
-    let lock = flock(&File::open(folder)?, FlockOperation::NonBlockingLockExclusive);
-    if lock != Err(Errno::WOULDBLOCK) {
-        return Ok(false);
-    }
-    File::create(folder.join(MARK_REQUEST))?;
-    Ok(true)
 }
 
 impl SegmentFile for File {

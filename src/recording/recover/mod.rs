@@ -14,6 +14,7 @@
 //! `walk.rs` goes through the file, `judge.rs` decides on messages, `window.rs` reads, this file writes and reports.
 
 mod judge;
+mod ledger;
 mod walk;
 mod window;
 

@@ -11,12 +11,12 @@ use mcap::{
 };
 
 use super::{
-    LostSpan, Recovery, Sink, StreamError,
+    Recovery, Sink, StreamError,
     judge::{Trust, is_exactly, is_whole},
+    ledger::Ledger,
     window::Window,
 };
 use crate::recording::{
-    reader::TopicSummary,
     records::{FRAMING_BYTES, MAX_RECORD_BYTES, parse, visit_chunk},
     topics::{self, Topic},
 };
@@ -26,8 +26,6 @@ const FRAMING: u64 = FRAMING_BYTES as u64;
 const CHUNK_HEADER_BYTES: u64 = 8 + 8 + 8 + 4 + 4 + 8;
 /// No compression has a longer name.
 const MAX_COMPRESSION_NAME_BYTES: u64 = 16;
-/// A larger jump of the sequence numbers is a new count, not a loss.
-const MAX_GAP: u32 = 100_000;
 
 /// What the bytes at an offset are.
 enum Step {
@@ -51,40 +49,26 @@ pub(super) fn walk<R: Read + Seek>(
     let mut walk = Walk {
         window,
         sink,
-        recovery: Recovery::default(),
+        ledger: Ledger::default(),
         trust: Trust::Plain,
         schemas: BTreeMap::new(),
-        channels: BTreeMap::new(),
-        last_log_ns: None,
         budget_bytes,
         body: Vec::new(),
     };
     walk.run()?;
-    Ok(walk.finish())
+    Ok(walk.ledger.close(walk.window.unreadable_bytes))
 }
 
 struct Walk<'a, R: Read + Seek, S: Sink> {
     window: Window<'a, R>,
     sink: &'a mut S,
-    recovery: Recovery,
+    ledger: Ledger,
     trust: Trust,
     /// Names.
     schemas: BTreeMap<u16, String>,
-    channels: BTreeMap<u16, Channel>,
-    last_log_ns: Option<u64>,
     /// Bytes that may still be looked at in vain.
     budget_bytes: u64,
     body: Vec<u8>,
-}
-
-struct Channel {
-    topic: String,
-    schema_name: String,
-    last_sequence: Option<u32>,
-    /// Something was lost since the last message.
-    behind_loss: bool,
-    /// Messages of it that were found damaged since then.
-    damaged: u64,
 }
 
 impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
@@ -110,16 +94,6 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
             }
         }
         Ok(())
-    }
-
-    fn finish(mut self) -> Recovery {
-        for channel in std::mem::take(&mut self.channels).into_values() {
-            if channel.damaged > 0 {
-                *self.recovery.lost_messages.entry(channel.topic).or_default() += channel.damaged;
-            }
-        }
-        self.recovery.unreadable_bytes = self.window.unreadable_bytes;
-        self.recovery
     }
 
     fn get(&mut self, offset: u64, length: u64) -> Result<&[u8], StreamError> {
@@ -170,7 +144,7 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
             op::FOOTER if length != 20 => return Ok(Step::Lost),
             _ if !op_is_known(opcode) || !self.may_start_record(next)? => return Ok(Step::Lost),
             op::DATA_END | op::FOOTER => {
-                self.recovery.reached_the_end = true;
+                self.ledger.note_end();
                 return Ok(Step::End);
             }
             _ => return Ok(Step::Next(next)),
@@ -182,7 +156,7 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
         // Attachments have a CRC of their own.
         let whole = (!holed || opcode == op::ATTACHMENT) && self.record(opcode, &body, self.trust)?;
         if !whole && opcode == op::MESSAGE {
-            self.note_damaged(&body);
+            self.ledger.note_damaged(&body);
         }
         self.body = body;
         if whole {
@@ -280,12 +254,12 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
             Record::Channel(record) => self.record_channel(record),
             Record::Message { header, data } => {
                 self.presume_channel(&header, &data)?;
-                let Some(channel) = self.channels.get(&header.channel_id) else { return Ok(false) };
-                if !is_whole(&channel.schema_name, &header, &data, trust) {
+                let Some(schema_name) = self.ledger.schema_name(header.channel_id) else { return Ok(false) };
+                if !is_whole(schema_name, &header, &data, trust) {
                     return Ok(false);
                 }
                 self.sink.message(&header, &data)?;
-                self.note_message(&header);
+                self.ledger.note_message(&header);
                 Ok(true)
             }
             Record::Metadata(record) => self.sink.metadata(&record).map(|()| true),
@@ -303,7 +277,7 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
     /// once, at the start, and may be what was lost.
     fn presume_channel(&mut self, header: &MessageHeader, data: &[u8]) -> Result<(), StreamError> {
         let id = header.channel_id;
-        if self.recovery.lost_bytes == 0 || self.channels.contains_key(&id) {
+        if !self.ledger.has_losses() || self.ledger.schema_name(id).is_some() {
             return Ok(());
         }
         let Some(topic) = presumed_topic(id).filter(|topic| is_exactly(topic.schema_name, header, data)) else {
@@ -334,59 +308,9 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
         let accepted = self.sink.channel(&record)?;
         if accepted {
             let schema_name = self.schemas.get(&record.schema_id).cloned().unwrap_or_default();
-            self.channels.entry(record.id).or_insert_with(|| Channel {
-                topic: record.topic,
-                schema_name,
-                last_sequence: None,
-                behind_loss: false,
-                damaged: 0,
-            });
+            self.ledger.declare(record.id, record.topic, schema_name);
         }
         Ok(accepted)
-    }
-
-    fn note_message(&mut self, header: &MessageHeader) {
-        let (recovery, stamp_ns) = (&mut self.recovery, header.log_time);
-        recovery.messages += 1;
-        let channel = self.channels.get_mut(&header.channel_id).expect("the caller looked it up");
-        let new = || TopicSummary {
-            schema_name: channel.schema_name.clone(),
-            messages: 0,
-            first_ns: stamp_ns,
-            last_ns: stamp_ns,
-        };
-        match recovery.topics.get_mut(&channel.topic) {
-            Some(topic) => {
-                topic.messages += 1;
-                topic.first_ns = topic.first_ns.min(stamp_ns);
-                topic.last_ns = topic.last_ns.max(stamp_ns);
-            }
-            None => drop(recovery.topics.insert(channel.topic.clone(), TopicSummary { messages: 1, ..new() })),
-        }
-        if let Some(span) = recovery.spans.last_mut()
-            && span.before_ns.is_none()
-        {
-            span.before_ns = Some(stamp_ns);
-        }
-        self.last_log_ns = Some(stamp_ns);
-        if channel.behind_loss {
-            let after_last = channel.last_sequence.and_then(|last| header.sequence.checked_sub(last)?.checked_sub(1));
-            let skipped = after_last.filter(|&gap| gap <= MAX_GAP).unwrap_or(0);
-            let lost = u64::from(skipped).max(channel.damaged);
-            if lost > 0 {
-                *recovery.lost_messages.entry(channel.topic.clone()).or_default() += lost;
-            }
-            (channel.behind_loss, channel.damaged) = (false, 0);
-        }
-        channel.last_sequence = Some(header.sequence);
-    }
-
-    fn note_damaged(&mut self, body: &[u8]) {
-        if let Ok(Record::Message { header, .. }) = parse(op::MESSAGE, body)
-            && let Some(channel) = self.channels.get_mut(&header.channel_id)
-        {
-            channel.damaged += 1;
-        }
     }
 
     /// Counts the messages of a chunk that is not used, as far as it can be followed.
@@ -395,7 +319,7 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
             let Some(next) = offset.checked_add(FRAMING + length.min(end)).filter(|&next| next <= end) else { break };
             if opcode == op::MESSAGE {
                 let body = self.get(offset + FRAMING, length.min(MESSAGE_HEADER_BYTES))?.to_vec();
-                self.note_damaged(&body);
+                self.ledger.note_damaged(&body);
             }
             offset = next;
         }
@@ -403,25 +327,15 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
     }
 
     fn lose(&mut self, from: u64, to: u64) -> Result<(), StreamError> {
-        self.channels.values_mut().for_each(|channel| channel.behind_loss = true);
-        self.recovery.lost_bytes += to - from;
+        let mut zero_bytes = 0;
         let mut at = from;
         while at < to {
             let piece = self.window.piece(at).map_err(StreamError::Read)?;
             let piece = &piece[..piece.len().min((to - at) as usize)];
-            self.recovery.zero_bytes += piece.iter().filter(|&&byte| byte == 0).count() as u64;
+            zero_bytes += piece.iter().filter(|&&byte| byte == 0).count() as u64;
             at += piece.len() as u64;
         }
-        let spans = &mut self.recovery.spans;
-        let is_full = spans.len() == Recovery::MAX_SPANS;
-        match spans.last_mut() {
-            Some(span) if span.before_ns.is_none() => span.bytes = to - span.offset,
-            _ if is_full => {}
-            _ => {
-                let after_ns = self.last_log_ns;
-                spans.push(LostSpan { offset: from, bytes: to - from, after_ns, before_ns: None });
-            }
-        }
+        self.ledger.note_lost(from..to, zero_bytes);
         Ok(())
     }
 
@@ -461,7 +375,7 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
         }
         let header = self.get(offset + FRAMING, MESSAGE_HEADER_BYTES)?;
         let id = header.first_chunk::<2>().map(|&id| u16::from_le_bytes(id));
-        let is_channel = |id| self.channels.contains_key(&id) || presumed_topic(id).is_some();
+        let is_channel = |id| self.ledger.schema_name(id).is_some() || presumed_topic(id).is_some();
         if length < MESSAGE_HEADER_BYTES || !id.is_some_and(is_channel) {
             return Ok(false);
         }
@@ -471,8 +385,8 @@ impl<R: Read + Seek, S: Sink> Walk<'_, R, S> {
         }
         let body = self.window.get(offset + FRAMING, length).map_err(StreamError::Read)?;
         let Ok(Record::Message { header, data }) = parse(opcode, body) else { return Ok(false) };
-        Ok(match self.channels.get(&header.channel_id) {
-            Some(channel) => is_whole(&channel.schema_name, &header, &data, Trust::Damaged),
+        Ok(match self.ledger.schema_name(header.channel_id) {
+            Some(schema_name) => is_whole(schema_name, &header, &data, Trust::Damaged),
             None => {
                 presumed_topic(header.channel_id).is_some_and(|topic| is_exactly(topic.schema_name, &header, &data))
             }
