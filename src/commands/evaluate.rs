@@ -242,6 +242,7 @@ fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::
         Smoothing::Track => Similarity::of(&plain, recipe),
     };
     let similarities: Vec<Option<Similarity>> = recipes.iter().map(similarity).collect();
+    let smoother = TrackSmoother::new(&plain, &plain.positions_m());
     let mut entries = Vec::new();
     for case in cases(args, &plain)? {
         let survey = match (case.variant, &fixed) {
@@ -249,7 +250,8 @@ fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::
             (Variant::Fixed, None) => continue,
             _ => &plain,
         };
-        entries.extend(trial_entries(args, recording, survey, (&recipes, &similarities), &truth_m, &case, progress)?);
+        let learning = Learning { recipes: &recipes, similarities: &similarities, smoother: &smoother };
+        entries.extend(trial_entries(args, recording, survey, &learning, &truth_m, &case, progress)?);
     }
     Ok(entries)
 }
@@ -282,12 +284,21 @@ fn cases(args: &Args, survey: &Survey) -> anyhow::Result<Vec<Case>> {
     Ok(cases)
 }
 
+/// What all cases learn with.
+struct Learning<'a> {
+    recipes: &'a [Recipe],
+    /// One a recipe; `None` where no track is smoothed, or nothing is known of how images change.
+    similarities: &'a [Option<Similarity>],
+    /// Of the positions as they were recorded.
+    smoother: &'a TrackSmoother,
+}
+
 /// All rows of one case: the recipes, and the answer that knows nothing.
 fn trial_entries(
     args: &Args,
     recording: &Recording,
     survey: &Survey,
-    (recipes, similarities): (&[Recipe], &[Option<Similarity>]),
+    learning: &Learning,
     truth_m: &[PositionM],
     case: &Case,
     progress: &Progress,
@@ -320,8 +331,10 @@ fn trial_entries(
         && case.split_name == args.split[0]
         && case.seed.is_none_or(|seed| seed == args.seed);
     let know_nothing_m = component_median(&pick(&case.split.learning, &recorded_m));
+    let noisy_smoother = (case.variant == Variant::Noisy).then(|| TrackSmoother::new(survey, &recorded_m));
+    let smoother = noisy_smoother.as_ref().unwrap_or(learning.smoother);
     let mut entries = Vec::new();
-    for (recipe, similarity) in recipes.iter().zip(similarities) {
+    for (recipe, similarity) in learning.recipes.iter().zip(learning.similarities) {
         let variant = match case.variant {
             Variant::Plain => "",
             Variant::Noisy => " (noisy)",
@@ -338,7 +351,7 @@ fn trial_entries(
                     learned.extend(&case.split.validation);
                     learned.sort_unstable();
                 }
-                TrackSmoother::new(survey, &recorded_m).smoothed(&learned, similarity.as_ref()).positions_m
+                smoother.smoothed(&learned, similarity.as_ref()).positions_m
             }
         };
         let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &learned_m };
