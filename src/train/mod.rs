@@ -3,6 +3,7 @@
 //! A [`Survey`] holds positions and properties of all frames; a [`Recipe`] says how they become features and Gaussian
 //! processes; [`run`] carries out the paper's protocol on a [`Split`]; [`train`] makes a map of everything.
 
+mod axes;
 mod folded;
 mod group;
 pub mod noise_whitening;

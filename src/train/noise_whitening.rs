@@ -5,10 +5,10 @@
 //! instead, and the directions that vary most over places, measured in that noise, become the features: Fisher's
 //! discriminant (Rao 1948), with a Gaussian process as the model of what a place looks like.
 
-use faer::linalg::solvers::Svd;
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{Mat, MatRef, Par, Side};
 
+use super::axes::{Axes, add_ridge};
 use super::group::LearnError;
 use crate::features::scaling::{Scaling, ScalingError};
 use crate::gp::{GpError, Hyperparameters, LearningPositions, Posterior};
@@ -22,8 +22,6 @@ pub struct NoiseWhitening {
     pub hyperparameters: Hyperparameters,
 }
 
-/// Directions whose singular value is below this share of the largest are null.
-const NULL_SINGULAR_RATIO: f64 = 1e-5;
 /// Noise-to-signal variance ratios that are tried: 2^−10, 2^−9.5, …, 2^2.5.
 const LOG2_NOISE_RATIOS: std::ops::RangeInclusive<i32> = -20..=5;
 
@@ -47,21 +45,12 @@ pub fn learn(
     properties: MatRef<f64>,
     changes: MatRef<f64>,
 ) -> Result<NoiseWhitening, LearnError> {
-    let (n, d) = (properties.nrows(), properties.ncols());
+    let n = properties.nrows();
     if n < 2 {
         return Err(ScalingError::TooFewImages { rows: n }.into());
     }
-    let mean: Vec<f64> = (0..d).map(|k| properties.col(k).iter().sum::<f64>() / n as f64).collect();
-    let centered = Mat::from_fn(n, d, |i, k| properties[(i, k)] - mean[k]);
-    let svd = Svd::new_thin(centered.as_ref()).map_err(|_| ScalingError::NoVariance { rows: n })?;
-    let singular: Vec<f64> = svd.S().column_vector().iter().copied().collect();
-    let largest = singular.first().copied().unwrap_or(0.0);
-    let rank = singular.iter().take_while(|&&s| s > NULL_SINGULAR_RATIO * largest).count();
-    if rank == 0 {
-        return Err(ScalingError::NoVariance { rows: n }.into());
-    }
-    let basis = svd.V().subcols(0, rank);
-    let z = Mat::from_fn(n, rank, |i, r| svd.U()[(i, r)] * singular[r]);
+    let axes = Axes::of(properties).ok_or(ScalingError::NoVariance { rows: n })?;
+    let z = &axes.z;
 
     let length_m = (settings.length_scale_spacings * learning.spacing_m()).max(1e-6);
     let unit = Hyperparameters { signal_std: 1.0, noise_std: 0.0, length_scale_m: [length_m; 2] };
@@ -71,24 +60,20 @@ pub fn learn(
     let residual = between.as_ref().unwrap_or(&loo.residual);
     let mut noise = residual.transpose() * residual * (1.0 / residual.nrows() as f64);
     if changes.nrows() > 0 {
-        let projected = changes * basis;
-        noise += projected.transpose() * &projected * (1.0 / changes.nrows() as f64);
+        noise += axes.covariance_of(changes);
     }
-    let mean_eigenvalue = (0..rank).map(|r| noise[(r, r)]).sum::<f64>() / rank as f64;
-    for r in 0..rank {
-        noise[(r, r)] += settings.ridge * mean_eigenvalue + f64::MIN_POSITIVE;
-    }
-    let signal = z.transpose() * &z * (1.0 / n as f64);
+    add_ridge(&mut noise, settings.ridge);
+    let signal = z.transpose() * z * (1.0 / n as f64);
     let directions =
         discriminant_directions(&signal, &noise, settings.features).ok_or(ScalingError::NoVariance { rows: n })?;
-    let projection = (basis * directions).transpose().to_owned();
+    let projection = (&axes.basis * directions).transpose().to_owned();
     let scale = 1.0 / loo.mean_variance;
     let hyperparameters = Hyperparameters {
         signal_std: scale.sqrt(),
         noise_std: (loo.noise_ratio * scale).sqrt(),
         length_scale_m: [length_m; 2],
     };
-    Ok(NoiseWhitening { scaling: Scaling { mean, projection }, hyperparameters })
+    Ok(NoiseWhitening { scaling: Scaling { mean: axes.mean, projection }, hyperparameters })
 }
 
 /// Fewer frames than this at places that several recordings saw say nothing about the change between them.

@@ -7,12 +7,12 @@
 //! Images are compared without regard to any position: in features learned from positions, images fit the positions they
 //! were learned from, and every match would confirm the error it was to find.
 
-use faer::linalg::solvers::Svd;
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::{Mat, MatRef, Par, Side};
 
 use super::adjust::Equation;
 use crate::gp::{Hyperparameters, LearningPositions, Posterior};
+use crate::train::axes::{Axes, add_ridge};
 use crate::types::{PositionM, distance_m};
 
 /// Inner products of images.
@@ -24,30 +24,19 @@ pub struct Similarity {
 
 /// Added to the covariance of the changes, as a share of its mean eigenvalue.
 const RIDGE: f64 = 0.05;
-const NULL_SINGULAR_RATIO: f64 = 1e-5;
 
 impl Similarity {
     /// Of images with `properties`, n × d, that perturbations change by `changes`, p × d: the Mahalanobis inner product
     /// with the covariance of the changes. `None` where nothing varies or no perturbations were made.
     pub fn learn(properties: MatRef<f64>, changes: MatRef<f64>) -> Option<Self> {
-        let (n, d) = (properties.nrows(), properties.ncols());
-        if changes.nrows() == 0 || n < 2 {
+        if changes.nrows() == 0 || properties.nrows() < 2 {
             return None;
         }
-        let mean: Vec<f64> = (0..d).map(|k| properties.col(k).iter().sum::<f64>() / n as f64).collect();
-        let centered = Mat::from_fn(n, d, |i, k| properties[(i, k)] - mean[k]);
-        let svd = Svd::new_thin(centered.as_ref()).ok()?;
-        let singular: Vec<f64> = svd.S().column_vector().iter().copied().collect();
-        let rank = singular.iter().take_while(|&&s| s > NULL_SINGULAR_RATIO * singular[0]).count();
-        if rank == 0 {
-            return None;
-        }
-        let projected = changes * svd.V().subcols(0, rank);
-        let mut noise = projected.transpose() * &projected * (1.0 / changes.nrows() as f64);
-        let ridge = RIDGE * (0..rank).map(|r| noise[(r, r)]).sum::<f64>() / rank as f64;
-        (0..rank).for_each(|r| noise[(r, r)] += ridge);
+        let axes = Axes::of(properties)?;
+        let mut noise = axes.covariance_of(changes);
+        add_ridge(&mut noise, RIDGE);
         let factor = noise.llt(Side::Lower).ok()?;
-        let mut white = Mat::from_fn(rank, n, |r, i| svd.U()[(i, r)] * singular[r]);
+        let mut white = axes.z.transpose().to_owned();
         solve_lower_triangular_in_place(factor.L(), white.as_mut(), Par::Seq);
         Some(Self { products: white.transpose() * &white })
     }
@@ -81,7 +70,7 @@ pub struct Passes<'a> {
 const APART_REACHES: f64 = 3.0;
 /// Steps of the search, fractions of the spacing.
 const STEP_SPACINGS: f64 = 0.1;
-/// Length scale and noise-to-signal ratio of the Gaussian process along a pass, as in the default recipe.
+/// Length scale and noise-to-signal ratio of the Gaussian process along a pass.
 const LENGTH_SPACINGS: f64 = 1.75;
 const NOISE_RATIO: f64 = 0.1;
 const MIN_FRAMES: usize = 4;
