@@ -43,8 +43,8 @@ use crate::{
 pub const STOP_LIMIT: Duration = Duration::from_secs(20);
 /// Part of [`STOP_LIMIT`] that devices have to stop.
 const DEVICES_STOP_LIMIT: Duration = Duration::from_secs(2);
-/// Frames on their way to the survey task: a third of a second, which a busy computer may well take.
-const FRAME_QUEUE: usize = 10;
+/// Frames on their way to the survey task: a second, which a busy computer may well take.
+const FRAME_QUEUE: usize = 32;
 /// Chunks and edges on their way to it: half a minute.
 const EVENT_QUEUE: usize = 4096;
 

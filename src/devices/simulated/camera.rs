@@ -1,5 +1,10 @@
 //! A camera in the simulated world.
 
+use std::{
+    sync::mpsc::{self, SyncSender},
+    thread,
+};
+
 use super::{FaultKind, Simulation};
 use crate::{
     devices::{
@@ -19,12 +24,12 @@ const WHOLE_PART: f64 = 0.6;
 /// A real camera's driver reports a silence after this time \[s\].
 const STALL_TIMEOUT_S: f64 = 2.0;
 
+/// Frames that are rendered before they are due: one that takes longer than its interval delays none.
+const FRAMES_AHEAD: usize = 32;
+
 /// Frames at a steady rate; those that the computer is too slow to render are skipped, as a camera does.
 pub struct SimulatedCamera {
-    simulation: Simulation,
-    renderer: Renderer,
-    pool: BufferPool,
-    mender: MjpegMender,
+    darkroom: Darkroom,
     /// Number of the next exposure since the start of the drive.
     next: u64,
 }
@@ -32,11 +37,11 @@ pub struct SimulatedCamera {
 impl SimulatedCamera {
     pub fn new(simulation: Simulation, renderer: Renderer) -> Self {
         let mender = MjpegMender::new(simulation.settings.width_px, simulation.settings.height_px);
-        Self { simulation, renderer, pool: BufferPool::default(), mender, next: 0 }
+        Self { darkroom: Darkroom { simulation, renderer, pool: BufferPool::default(), mender }, next: 0 }
     }
 
     pub fn facts(&self) -> CameraFacts {
-        let settings = &self.simulation.settings;
+        let settings = &self.darkroom.simulation.settings;
         CameraFacts {
             name: "simulated".into(),
             width_px: settings.width_px,
@@ -53,61 +58,97 @@ impl SimulatedCamera {
         stop: &Stop,
         emit: &mut dyn FnMut(CameraEvent),
     ) -> Result<(), DeviceError> {
-        if self.has(FaultKind::CameraUnplugged, clock.monotonic_ns()) {
+        let opened_ns = clock.monotonic_ns();
+        if self.darkroom.simulation.is_troubled_by(FaultKind::CameraUnplugged, opened_ns) {
             return Err(DeviceError::NotPresent { device: DEVICE.into() });
         }
         emit(CameraEvent::Opened(self.facts()));
         // What was exposed while the camera was away is nobody's loss.
-        while self.stamp_ns(self.next) < clock.monotonic_ns() {
+        while self.darkroom.stamp_ns(self.next) < opened_ns {
             self.next += 1;
         }
-        let opened_at = self.next;
-        let mut last_ns = clock.monotonic_ns();
-        while !self.is_over() {
-            let stamp_ns = self.stamp_ns(self.next);
-            if self.has(FaultKind::CameraUnplugged, stamp_ns) {
-                return Err(DeviceError::Disconnected { device: DEVICE.into() });
-            }
-            let frame = self.render((self.next - opened_at) as u32);
-            if wait_until(frame.arrival_ns, clock, stop) {
-                return Ok(());
-            }
-            if self.has(FaultKind::CameraStalled, stamp_ns) {
-                let silence_s = stamp_ns.saturating_sub(last_ns) as f64 * 1e-9;
-                if silence_s >= STALL_TIMEOUT_S {
-                    return Err(DeviceError::TimedOut { device: DEVICE.into(), silence_s });
+        let (first, next, darkroom) = (self.next, &mut self.next, &mut self.darkroom);
+        let simulation = darkroom.simulation.clone();
+        thread::scope(|scope| {
+            // The thread ends when this end of the channel is gone.
+            let (rendered, frames) = mpsc::sync_channel(FRAMES_AHEAD);
+            scope.spawn(move || darkroom.render_ahead(first, clock, &rendered));
+            let mut last_ns = opened_ns;
+            for (number, event) in frames {
+                *next = number + 1;
+                let CameraEvent::Frame(frame) = event else {
+                    emit(event);
+                    continue;
+                };
+                if simulation.is_troubled_by(FaultKind::CameraUnplugged, frame.stamp_ns) {
+                    return Err(DeviceError::Disconnected { device: DEVICE.into() });
                 }
-            } else {
-                last_ns = stamp_ns;
-                emit(CameraEvent::Frame(frame));
+                if wait_until(frame.arrival_ns, clock, stop) {
+                    return Ok(());
+                }
+                if simulation.is_troubled_by(FaultKind::CameraStalled, frame.stamp_ns) {
+                    let silence_s = frame.stamp_ns.saturating_sub(last_ns) as f64 * 1e-9;
+                    if silence_s >= STALL_TIMEOUT_S {
+                        return Err(DeviceError::TimedOut { device: DEVICE.into(), silence_s });
+                    }
+                } else {
+                    last_ns = frame.stamp_ns;
+                    emit(CameraEvent::Frame(frame));
+                }
             }
-            self.next += 1;
-            self.skip_what_is_late(clock.monotonic_ns(), emit);
-        }
-        Ok(())
+            Ok(())
+        })
     }
 
     /// The next frame, without a clock; `None` at the end of the drive. Frames that a fault swallows are left out.
     pub fn next_frame(&mut self) -> Option<CameraFrame> {
-        while !self.is_over() {
-            let (number, stamp_ns) = (self.next, self.stamp_ns(self.next));
+        while !self.darkroom.is_over(self.next) {
+            let number = self.next;
             self.next += 1;
-            if !self.has(FaultKind::CameraUnplugged, stamp_ns) && !self.has(FaultKind::CameraStalled, stamp_ns) {
-                self.next -= 1;
-                let frame = self.render(number as u32);
-                self.next += 1;
-                return Some(frame);
+            let stamp_ns = self.darkroom.stamp_ns(number);
+            let swallowed = [FaultKind::CameraUnplugged, FaultKind::CameraStalled];
+            if !swallowed.iter().any(|&kind| self.darkroom.simulation.is_troubled_by(kind, stamp_ns)) {
+                return Some(self.darkroom.render(number, number as u32));
             }
         }
         None
     }
+}
 
-    fn render(&mut self, sequence: u32) -> CameraFrame {
-        let stamp_ns = self.stamp_ns(self.next);
-        let time_s = self.simulation.time_s(stamp_ns);
+/// Where frames are made.
+struct Darkroom {
+    simulation: Simulation,
+    renderer: Renderer,
+    pool: BufferPool,
+    mender: MjpegMender,
+}
+
+impl Darkroom {
+    /// Renders from frame `first` to the end of the drive, as far ahead as the channel takes; what is late before it was
+    /// begun is left out and reported, under the number of the last such frame.
+    fn render_ahead(&mut self, first: u64, clock: &dyn Clock, rendered: &SyncSender<(u64, CameraEvent)>) {
+        let mut number = first;
+        while !self.is_over(number) {
+            let now_ns = clock.monotonic_ns();
+            let late = (number..).take_while(|&n| !self.is_over(n) && self.stamp_ns(n) + TRANSFER_NS < now_ns).count();
+            let event = if late > 0 {
+                number += late as u64 - 1;
+                CameraEvent::Lost(Lost { count: late as u64, reason: SKIPPED, stamp_ns: now_ns })
+            } else {
+                CameraEvent::Frame(self.render(number, (number - first) as u32))
+            };
+            if rendered.send((number, event)).is_err() {
+                return;
+            }
+            number += 1;
+        }
+    }
+
+    fn render(&mut self, number: u64, sequence: u32) -> CameraFrame {
+        let stamp_ns = self.stamp_ns(number);
         let mut jpeg = self.pool.take();
-        self.renderer.render_jpeg(&self.simulation.pose_at(stamp_ns), time_s, &mut jpeg);
-        if self.has(FaultKind::FramesDamaged, stamp_ns) {
+        self.renderer.render_jpeg(&self.simulation.pose_at(stamp_ns), self.simulation.time_s(stamp_ns), &mut jpeg);
+        if self.simulation.is_troubled_by(FaultKind::FramesDamaged, stamp_ns) {
             let whole = (jpeg.len() as f64 * WHOLE_PART) as usize;
             jpeg.truncate(whole);
         }
@@ -115,26 +156,11 @@ impl SimulatedCamera {
         CameraFrame { sequence, stamp_ns, arrival_ns: stamp_ns + TRANSFER_NS, jpeg, damage }
     }
 
-    fn skip_what_is_late(&mut self, now_ns: u64, emit: &mut dyn FnMut(CameraEvent)) {
-        let mut count = 0;
-        while !self.is_over() && self.stamp_ns(self.next) + TRANSFER_NS < now_ns {
-            self.next += 1;
-            count += 1;
-        }
-        if count > 0 {
-            emit(CameraEvent::Lost(Lost { count, reason: SKIPPED, stamp_ns: now_ns }));
-        }
-    }
-
     fn stamp_ns(&self, number: u64) -> u64 {
         self.simulation.stamp_ns(number as f64 / self.simulation.settings.frame_rate_hz)
     }
 
-    fn is_over(&self) -> bool {
-        self.stamp_ns(self.next) >= self.simulation.stamp_ns(self.simulation.duration_s())
-    }
-
-    fn has(&self, kind: FaultKind, stamp_ns: u64) -> bool {
-        self.simulation.settings.has(kind, self.simulation.time_s(stamp_ns))
+    fn is_over(&self, number: u64) -> bool {
+        self.stamp_ns(number) >= self.simulation.stamp_ns(self.simulation.duration_s())
     }
 }

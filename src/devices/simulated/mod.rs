@@ -272,6 +272,10 @@ impl Simulation {
         self.settings.intervals_s(kind).map(|interval_s| self.stamp_ns(interval_s.start)..self.stamp_ns(interval_s.end))
     }
 
+    fn is_troubled_by(&self, kind: FaultKind, stamp_ns: u64) -> bool {
+        self.settings.has(kind, self.time_s(stamp_ns))
+    }
+
     /// The truth.
     pub fn pose_at(&self, stamp_ns: u64) -> Pose {
         self.drive.pose_at(self.time_s(stamp_ns))
