@@ -13,6 +13,16 @@ const BINS: usize = 12;
 /// Azimuthal harmonics kept, from 0.
 const HARMONICS: usize = 5;
 
+/// What a [compass signature](GradientSignature::compass) is of: unsigned orientation bins, elevation bands and harmonics
+/// from 1.
+const COMPASS_BINS: usize = BINS / 2;
+const COMPASS_BANDS: usize = 8;
+pub const COMPASS_HARMONICS: usize = 16;
+/// Length of a compass signature: a real and an imaginary part a bin, band and harmonic.
+pub const COMPASS_BYTES: usize = COMPASS_BINS * COMPASS_BANDS * COMPASS_HARMONICS * 2;
+/// Numbers of a signature are at most this.
+const COMPASS_GREATEST: f32 = 127.0;
+
 /// Whether an edge and its opposite are told apart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sign {
@@ -83,6 +93,8 @@ pub struct GradientSignature {
     bins: Vec<f32>,
     /// The first harmonics of every row of `bins`: bin × band × harmonic.
     harmonics: Vec<Complex<f32>>,
+    /// The harmonics that a compass needs: bin × band × harmonic.
+    compass: Vec<Complex<f32>>,
     spectrum: Vec<Complex<f32>>,
     fft_scratch: Vec<Complex<f32>>,
 }
@@ -111,6 +123,7 @@ impl GradientSignature {
             local_mean: plane(),
             bins: vec![0.0; BINS * sizes.bands * columns],
             harmonics: vec![Complex::default(); BINS * sizes.bands * HARMONICS],
+            compass: vec![Complex::default(); COMPASS_BINS * COMPASS_BANDS * COMPASS_HARMONICS],
             spectrum: transform.make_output_vec(),
             fft_scratch: transform.make_scratch_vec(),
             transform,
@@ -147,6 +160,17 @@ impl GradientSignature {
         }
         let norm = properties.iter().map(|y| y * y).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
         properties.iter_mut().for_each(|y| *y /= norm);
+    }
+
+    /// The compass signature of the panorama last looked at: bin × band × harmonic × (real, imaginary part). Magnitudes are
+    /// their square roots, which makes the peak of a correlation sharp, and scaled to ±127.
+    pub fn compass(&self, signature: &mut [i8]) {
+        let greatest = self.compass.iter().map(|harmonic| harmonic.norm()).fold(f32::MIN_POSITIVE, f32::max);
+        for (parts, harmonic) in signature.chunks_exact_mut(2).zip(&self.compass) {
+            let scale = COMPASS_GREATEST / (harmonic.norm() * greatest).sqrt().max(f32::MIN_POSITIVE);
+            parts[0] = (harmonic.re * scale).round() as i8;
+            parts[1] = (harmonic.im * scale).round() as i8;
+        }
     }
 
     /// plane = log of the reduced panorama.
@@ -210,12 +234,17 @@ impl GradientSignature {
     }
 
     fn transform_bands(&mut self) {
+        let bands = self.sizes.bands;
+        self.compass.fill(Complex::default());
         let rows = self.bins.chunks_exact_mut(self.columns);
-        for (row, harmonics) in rows.zip(self.harmonics.chunks_exact_mut(HARMONICS)) {
+        for (i, (row, harmonics)) in rows.zip(self.harmonics.chunks_exact_mut(HARMONICS)).enumerate() {
             self.transform
                 .process_with_scratch(row, &mut self.spectrum, &mut self.fft_scratch)
                 .expect("the buffers come from the plan");
             harmonics.copy_from_slice(&self.spectrum[..HARMONICS]);
+            let (bin, band) = (i / bands % COMPASS_BINS, i % bands * COMPASS_BANDS / bands);
+            let compass = &mut self.compass[(bin * COMPASS_BANDS + band) * COMPASS_HARMONICS..][..COMPASS_HARMONICS];
+            compass.iter_mut().zip(&self.spectrum[1..]).for_each(|(sum, harmonic)| *sum += harmonic);
         }
     }
 }

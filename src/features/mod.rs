@@ -15,6 +15,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::panorama::Panorama;
+pub use gradient::{COMPASS_BYTES, COMPASS_HARMONICS};
 use gradient::{GradientSignature, Sign};
 use steerable::{Response, SteerablePyramid};
 
@@ -170,6 +171,15 @@ impl Describer {
                 Descriptor::GradientCoarse => self.gradient_coarse.describe(Sign::Signed, properties),
             }
         }
+    }
+
+    /// The compass signature of `panorama`, [`COMPASS_BYTES`] long. Costs next to nothing right after a description of the
+    /// same panorama with [`Descriptor::GradientCoarse`].
+    pub fn compass(&mut self, described: &[Descriptor], panorama: &Panorama, signature: &mut [i8]) {
+        if !described.contains(&Descriptor::GradientCoarse) {
+            self.gradient_coarse.look(panorama);
+        }
+        self.gradient_coarse.compass(signature);
     }
 
     /// Vectors of the right lengths for [`describe`](Self::describe).

@@ -116,6 +116,18 @@ impl FieldOnCells {
         }
     }
 
+    /// The log-likelihood of `features` at a place of which nothing is known, whose predicted mean is that of all places,
+    /// up to a constant of the field: what the best cell is compared with. `None` for a noise model that has none.
+    pub fn log_likelihood_nowhere(&self, features: &[f32], noise: NoiseModel) -> Option<f32> {
+        match noise {
+            NoiseModel::Gaussian => None,
+            NoiseModel::UnknownScale => {
+                let square: f32 = features.iter().map(|z| z * z).sum();
+                Some(-0.5 * self.features as f32 * square.max(f32::MIN_POSITIVE).ln())
+            }
+        }
+    }
+
     /// Eq. 10 of every feature on its own, feature × cell.
     pub fn log_likelihood_of_each(&self, features: &[f32]) -> Vec<f32> {
         let mut table = Vec::with_capacity(self.features * self.cells);

@@ -1,7 +1,29 @@
-//! One frame's features against the map: where is it?
+//! Frames against the map: where is the vehicle?
+//!
+//! ```text
+//! JPEG ─► luma ─► panorama ─► properties ─► features ─► log-likelihood of every cell ─► belief ─► estimate
+//!                     └─────► compass signature ─────────────────────────────────────────────────► heading
+//! ```
+//!
+//! [`Localizer`] takes frames all the way; [`Tracker`] is the part from the log-likelihood on, which also serves drives
+//! that are evaluated offline, where [`smooth`] adds what later frames say of earlier ones. The likelihood is in
+//! `likelihood`, the discrete Bayes filter in `belief` and `tracker`, the motion between frames in `motion`, and when a
+//! position may be said in `state`.
 
+mod belief;
 mod estimate;
+mod heading;
 mod likelihood;
+mod localizer;
+mod motion;
+mod smoother;
+mod state;
+mod tracker;
 
+pub use belief::Mode;
 pub use estimate::{most_likely_cell, refined_m};
 pub use likelihood::FieldOnCells;
+pub use localizer::{Localizer, Stage, Timings};
+pub use motion::{ConstantVelocity, Motion, MotionModel, MotionSettings};
+pub use smoother::{Smoothed, smooth};
+pub use tracker::{Observation, Tracked, Tracker};

@@ -11,6 +11,8 @@
 //! | `G/learning` | f64 \[n, k\] | learning features |
 //! | `G/field_mean` | f32 \[k, c\] | posterior mean of every feature on the cells |
 //! | `G/field_variance` | f32 \[k, c\] or \[1, c\] | predictive variance, noise included; one row where all share it |
+//! | `compass/yaw_rad` | f64 \[n\] | headings of the learning panoramas; absent where they are not known |
+//! | `compass/signatures` | i8 \[n, s\] | signatures of the learning panoramas, with `compass/yaw_rad` |
 //! | `sha256` | u8 \[32\] | of the metadata string and then, in the order of their names, name and data of all others |
 
 use std::collections::BTreeMap;
@@ -20,13 +22,17 @@ use faer::{Mat, MatRef};
 use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorView, serialize};
 use sha2::{Digest, Sha256};
 
-use super::{CandidateCells, FeatureMap, MapGroup, MapInfo};
+use super::{CandidateCells, Compass, FeatureMap, MapGroup, MapInfo};
+use crate::features::COMPASS_BYTES;
 use crate::features::scaling::Scaling;
+use crate::types::PositionM;
 
 /// What this build writes, and the only one it reads.
 pub const FORMAT_VERSION: u32 = 2;
 const METADATA_KEY: &str = "omniloc";
 const CHECKSUM: &str = "sha256";
+const COMPASS_YAWS: &str = "compass/yaw_rad";
+const COMPASS_SIGNATURES: &str = "compass/signatures";
 
 #[derive(Debug, thiserror::Error)]
 pub enum MapError {
@@ -71,6 +77,13 @@ pub fn to_bytes(map: &FeatureMap) -> Vec<u8> {
         insert("field_mean", Tensor::new(Dtype::F32, &[k, cells], floats(&group.field_mean)));
         let rows = group.field_variance.len() / cells.max(1);
         insert("field_variance", Tensor::new(Dtype::F32, &[rows, cells], floats(&group.field_variance)));
+    }
+    if let Some(compass) = &map.compass {
+        let yaws = compass.yaws_rad.iter().flat_map(|value| value.to_le_bytes()).collect();
+        tensors.insert(COMPASS_YAWS.to_owned(), Tensor::new(Dtype::F64, &[compass.yaws_rad.len()], yaws));
+        let signatures = compass.signatures.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let shape = [compass.yaws_rad.len(), COMPASS_BYTES];
+        tensors.insert(COMPASS_SIGNATURES.to_owned(), Tensor::new(Dtype::I8, &shape, signatures));
     }
     let info = serde_json::to_string(&map.info).expect("map information is plain data");
     let checksum = checksum(&info, tensors.iter().map(|(name, tensor)| (name.as_str(), tensor.bytes.as_slice())));
@@ -196,8 +209,21 @@ impl Parts<'_> {
                 field_variance,
             });
         }
-        let positions_m = positions.chunks_exact(2).map(|pair| [pair[0], pair[1]]).collect();
-        Ok(FeatureMap { info, positions_m, cells, groups })
+        let positions_m: Vec<PositionM> = positions.chunks_exact(2).map(|pair| [pair[0], pair[1]]).collect();
+        let compass = self.compass(&info, &positions_m)?;
+        Ok(FeatureMap { info, positions_m, cells, groups, compass })
+    }
+
+    fn compass(&self, info: &MapInfo, positions_m: &[PositionM]) -> Result<Option<Compass>, MapError> {
+        let Some(std_rad) = info.heading_std_rad else { return Ok(None) };
+        let n = positions_m.len();
+        let yaws_rad = self.exactly(COMPASS_YAWS, &[n], Dtype::F64, f64::from_le_bytes)?;
+        if let Some(bad) = yaws_rad.iter().find(|yaw_rad| yaw_rad.abs() > 100.0) {
+            return Err(MapError::Damaged(format!("{COMPASS_YAWS} holds {bad}")));
+        }
+        let signatures = self.exactly(COMPASS_SIGNATURES, &[n, COMPASS_BYTES], Dtype::I8, i8::from_le_bytes)?;
+        let sense = Compass::sense_of(info.calibration.azimuth);
+        Ok(Some(Compass { positions_m: positions_m.to_vec(), yaws_rad, signatures, sense, std_rad }))
     }
 
     /// The numbers of a tensor, and its shape.
@@ -257,6 +283,12 @@ impl Finite for f32 {
     }
 }
 
+impl Finite for i8 {
+    fn finite(&self) -> bool {
+        true
+    }
+}
+
 impl Finite for u32 {
     fn finite(&self) -> bool {
         true
@@ -280,6 +312,7 @@ mod tests {
         let loaded = from_bytes(&bytes).expect("sound");
         assert_eq!(loaded.info, map.info);
         assert_eq!((loaded.positions_m, loaded.cells), (map.positions_m, map.cells));
+        assert_eq!(loaded.compass, map.compass);
         for (loaded, group) in loaded.groups.iter().zip(&map.groups) {
             assert_eq!(loaded.scaling.mean, group.scaling.mean);
             assert_eq!(loaded.scaling.projection, group.scaling.projection);

@@ -5,6 +5,7 @@
 //! processes, and the posterior of every feature on the candidate cells, which is all that matching a frame reads.
 
 mod cells;
+mod compass;
 pub mod file;
 mod recipe;
 mod track;
@@ -13,6 +14,7 @@ use faer::Mat;
 use serde::{Deserialize, Serialize};
 
 pub use cells::{CandidateCells, CellsError, Grid};
+pub use compass::Compass;
 pub use file::{FORMAT_VERSION, MapError};
 pub use recipe::{
     GroupHyperparameters, GroupRecipe, Model, NoiseModel, NoiseWhiteningSettings, PERTURBED_COPIES, Recipe, RecipeName,
@@ -33,6 +35,8 @@ pub struct FeatureMap {
     pub cells: CandidateCells,
     /// In the order of [`MapInfo::groups`].
     pub groups: Vec<MapGroup>,
+    /// Panoramas of known heading, where the recordings have a yaw for every frame.
+    pub compass: Option<Compass>,
 }
 
 /// The numbers of one group: d properties, k features, n learning positions, c cells.
@@ -69,6 +73,13 @@ pub struct MapInfo {
     /// p(cell) ∝ exp(log-likelihood / temperature): learned from frames that were held back, whole recordings of them
     /// where there are several.
     pub temperature: f64,
+    /// Frames of places that are not in the map resemble their best cell less than this, but for one in twenty: how much
+    /// likelier it is than no place, in nats at the map's temperature. `None` where the map cannot tell.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub least_resemblance: Option<f64>,
+    /// One standard deviation of headings, measured on the learning panoramas \[rad\]. `None` without a compass.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub heading_std_rad: Option<f64>,
     /// Errors on frames that the choices were made on but that nothing was fitted to.
     pub validation: Vec<ValidationFigures>,
 }
@@ -132,6 +143,12 @@ impl MapInfo {
         if self.groups.is_empty() || self.recordings.is_empty() {
             return Err("it has no groups of features, or no recordings".into());
         }
+        if self.least_resemblance.is_some_and(|least| !(-1e6..=1e6).contains(&least)) {
+            return Err("a resemblance that cannot be".into());
+        }
+        if self.heading_std_rad.is_some_and(|std_rad| !(1e-6..=10.0).contains(&std_rad)) {
+            return Err("a deviation of headings that cannot be".into());
+        }
         if !(1e-3..=1e6).contains(&self.temperature) {
             return Err(format!("temperature {:e}", self.temperature));
         }
@@ -167,6 +184,20 @@ impl MapInfo {
         Ok(())
     }
 
+    /// One standard deviation, on either axis, of the positions that the map was learned from, as far as smoothing knows
+    /// it; 0 where they were taken as they are \[m\].
+    pub fn position_std_m(&self) -> f64 {
+        let known = |recording: &TrainedOn| match recording.track {
+            Some(TrackReport::Smoothed { remaining_std_m, .. }) => {
+                Some((recording.frames as f64, remaining_std_m * remaining_std_m))
+            }
+            _ => None,
+        };
+        let (frames, sum_m2) = (self.recordings.iter().filter_map(known))
+            .fold((0.0, 0.0), |(n, sum), (frames, variance_m2)| (n + frames, sum + frames * variance_m2));
+        if frames > 0.0 { (sum_m2 / frames).sqrt() } else { 0.0 }
+    }
+
     /// Refuses frames of a camera that the map does not fit: other image size, other donut.
     pub fn check_lens(&self, donut: &DonutCalibration, image_size_px: (usize, usize)) -> Result<(), OtherLens> {
         let ours = &self.calibration;
@@ -196,7 +227,7 @@ impl MapInfo {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::features::Descriptor;
+    use crate::features::{COMPASS_BYTES, Descriptor};
     use crate::types::{AzimuthSense, LensKind};
 
     /// Three positions, two features of `sp`.
@@ -238,6 +269,8 @@ pub(crate) mod tests {
                     hyperparameters: GroupHyperparameters::Shared(hyperparameters),
                 }],
                 temperature: 4.0,
+                least_resemblance: Some(-12.0),
+                heading_std_rad: Some(0.02),
                 validation: Vec::new(),
             },
             groups: vec![MapGroup {
@@ -249,6 +282,13 @@ pub(crate) mod tests {
                 field_mean: (0..2 * c).map(|i| i as f32 * 0.25).collect(),
                 field_variance: vec![0.5; c],
             }],
+            compass: Some(Compass {
+                positions_m: positions_m.clone(),
+                yaws_rad: vec![0.1, 0.2, -3.0],
+                signatures: (0..3 * COMPASS_BYTES).map(|i| (i % 255) as i8).collect(),
+                sense: 1.0,
+                std_rad: 0.02,
+            }),
             positions_m,
             cells,
         }

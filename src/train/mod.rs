@@ -8,6 +8,7 @@ mod folded;
 mod group;
 pub mod noise_whitening;
 pub mod perturbation;
+mod recognition;
 mod split;
 mod subset;
 mod survey;
@@ -25,8 +26,8 @@ pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
 
 use crate::gp::LearningPositions;
 use crate::map::{
-    CandidateCells, FORMAT_VERSION, FeatureMap, GroupInfo, MapGroup, MapInfo, Recipe, Selection, Smoothing, SplitKind,
-    TrackReport, TrainedOn, ValidationFigures,
+    CandidateCells, Compass, FORMAT_VERSION, FeatureMap, GroupInfo, MapGroup, MapInfo, Recipe, Selection, Smoothing,
+    SplitKind, TrackReport, TrainedOn, ValidationFigures,
 };
 use crate::metrics::{ErrorFigures, component_median};
 use crate::types::{PositionM, distance_m};
@@ -91,6 +92,7 @@ pub fn train(
     });
     let validation = validation.collect();
     let temperature = temperature_between_recordings(survey, &trial)?.or(outcomes.temperature).unwrap_or(1.0);
+    let least_resemblance = outcomes.least_resemblance.map(|resemblance| resemblance / temperature);
 
     let everything: Vec<usize> = (0..survey.len()).collect();
     let smoothed = smoothed(&everything);
@@ -130,6 +132,7 @@ pub fn train(
     if groups.is_empty() {
         return Err(TrialError::NothingKept);
     }
+    let compass = compass_of(survey, learning.positions());
     let frames_of = |recording: usize| survey.frames.iter().filter(|frame| frame.recording == recording).count();
     let info = MapInfo {
         format_version: FORMAT_VERSION,
@@ -151,9 +154,24 @@ pub fn train(
         grid: cells.grid,
         groups: infos,
         temperature,
+        least_resemblance,
+        heading_std_rad: compass.as_ref().map(|compass| compass.std_rad),
         validation,
     };
-    Ok(FeatureMap { info, positions_m: learning.positions().to_vec(), cells, groups })
+    Ok(FeatureMap { info, positions_m: learning.positions().to_vec(), cells, groups, compass })
+}
+
+/// The panoramas of `survey` at the positions `learned_m`, if it has them and every frame has a yaw.
+fn compass_of(survey: &Survey, learned_m: &[PositionM]) -> Option<Compass> {
+    let yaws_rad: Vec<f64> = survey.frames.iter().map(|frame| frame.yaw_rad).collect::<Option<_>>()?;
+    if survey.compass().is_empty() {
+        return None;
+    }
+    let sense = Compass::sense_of(survey.calibration.azimuth);
+    let (positions_m, signatures) = (learned_m.to_vec(), survey.compass().to_vec());
+    let compass = Compass { positions_m, yaws_rad, signatures, sense, std_rad: 0.0 };
+    let std_rad = compass.measured_std_rad();
+    Some(Compass { std_rad, ..compass })
 }
 
 /// Recordings that are held back in turn to learn the temperature: each costs a training.

@@ -6,7 +6,7 @@ use faer::Mat;
 use rayon::prelude::*;
 
 use super::perturbation::perturbed;
-use crate::features::{Describer, Descriptor};
+use crate::features::{COMPASS_BYTES, Describer, Descriptor};
 use crate::jpeg::LumaDecoder;
 use crate::panorama::{Panorama, UnwrapTable};
 use crate::recording::{Recording, RecordingError, SurveyFrame};
@@ -20,6 +20,8 @@ pub struct Survey {
     /// Width and height of the camera images \[px\].
     pub image_size_px: (usize, usize),
     pub frames: Vec<SurveyedFrame>,
+    /// Frame × [`COMPASS_BYTES`]; empty if not asked for.
+    compass: Vec<i8>,
     properties: BTreeMap<Descriptor, Properties>,
 }
 
@@ -51,6 +53,8 @@ pub struct SurveyOptions {
     pub descriptors: Vec<Descriptor>,
     /// Turn every panorama by its yaw so that column 0 looks east: the paper's “(fixed)” rows.
     pub fixed: bool,
+    /// Compass signatures too.
+    pub compass: bool,
     /// Perturbed copies of every frame, for the descriptors in `perturbed`.
     pub repetitions: usize,
     pub perturbed: Vec<Descriptor>,
@@ -100,6 +104,7 @@ impl Survey {
             origin: first.origin,
             image_size_px: (0, 0),
             frames: Vec::new(),
+            compass: Vec::new(),
             properties: options.descriptors.iter().map(|&descriptor| (descriptor, Properties::default())).collect(),
         };
         for (number, recording) in recordings.iter().enumerate() {
@@ -164,7 +169,7 @@ impl Survey {
         let table = UnwrapTable::build(&self.calibration, size_px.0, size_px.1)
             .map_err(|source| SurveyError::Calibration { recording: name(), source })?;
 
-        let described: Vec<Vec<(Vec<f32>, Vec<f32>)>> = batch
+        let described: Vec<DescribedFrame> = batch
             .par_iter()
             .enumerate()
             .map_init(
@@ -187,7 +192,8 @@ impl Survey {
             )
             .collect::<Result<_, SurveyError>>()?;
 
-        for ((frame, _), properties) in batch.iter().zip(described) {
+        for ((frame, _), DescribedFrame { properties, compass }) in batch.iter().zip(described) {
+            self.compass.extend(compass);
             self.frames.push(SurveyedFrame {
                 recording: number,
                 index: frame.index,
@@ -223,6 +229,11 @@ impl Survey {
         rows.iter().map(|&row| self.frames[row].recording).collect()
     }
 
+    /// Compass signatures of all frames, frame × [`COMPASS_BYTES`]; empty if they were not asked for.
+    pub fn compass(&self) -> &[i8] {
+        &self.compass
+    }
+
     /// Properties of the frames at `rows`, n × d.
     ///
     /// # Panics
@@ -242,15 +253,25 @@ impl Survey {
     }
 }
 
-/// Properties of one panorama, and how they change under perturbations: a pair a descriptor.
+/// What is kept of one panorama.
+struct DescribedFrame {
+    /// Properties and how they change under perturbations, a pair a descriptor.
+    properties: Vec<(Vec<f32>, Vec<f32>)>,
+    compass: Vec<i8>,
+}
+
 fn describe_frame(
     describer: &mut Describer,
     panorama: &Panorama,
     options: &SurveyOptions,
     stream: u64,
-) -> Vec<(Vec<f32>, Vec<f32>)> {
+) -> DescribedFrame {
     let mut clean = Describer::room_for(&options.descriptors);
     describer.describe(&options.descriptors, panorama, &mut clean);
+    let mut compass = vec![0; if options.compass { COMPASS_BYTES } else { 0 }];
+    if options.compass {
+        describer.compass(&options.descriptors, panorama, &mut compass);
+    }
     let mut changes = vec![Vec::new(); options.descriptors.len()];
     let mut there = Describer::room_for(&options.perturbed);
     for repetition in 0..if options.perturbed.is_empty() { 0 } else { options.repetitions as u64 } {
@@ -262,5 +283,5 @@ fn describe_frame(
             changes[at].extend(there.iter().zip(&clean[at]).map(|(there, here)| there - here));
         }
     }
-    clean.into_iter().zip(changes).collect()
+    DescribedFrame { properties: clean.into_iter().zip(changes).collect(), compass }
 }

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::folded::folded_selection;
 use super::group::{LearnError, LearnedGroup};
 use super::perturbation::standard_normal;
+use super::recognition::{self, HeldBack};
 use super::split::Split;
 use super::subset::{LikelihoodTable, backward_elimination};
 use super::survey::Survey;
@@ -43,6 +44,9 @@ pub struct Outcomes {
     /// What the fused log-likelihood of the validation frames, none of which was learned from, has to be divided by to be
     /// as sharp as their errors; `None` with too few of them.
     pub temperature: Option<f64>,
+    /// Of frames of no place in the map, not divided by the temperature: see
+    /// [`MapInfo::least_resemblance`](crate::map::MapInfo::least_resemblance).
+    pub least_resemblance: Option<f64>,
 }
 
 /// What a trial brought for one row of the table: a group, or all of them fused.
@@ -134,7 +138,7 @@ pub fn run(survey: &Survey, trial: &Trial, on_step: impl Fn(Step) + Sync) -> Res
     for (row, before) in refitted.rows.iter_mut().zip(first.rows) {
         row.kept_validation_m = before.kept_validation_m;
     }
-    Ok(Outcomes { temperature: first.temperature, ..refitted })
+    Ok(Outcomes { temperature: first.temperature, least_resemblance: first.least_resemblance, ..refitted })
 }
 
 fn run_once(
@@ -168,6 +172,8 @@ fn run_once(
     let mut outcomes = Vec::new();
     let mut groups = Vec::new();
     let mut fused: Option<[Likelihoods; 3]> = None;
+    // Of the validation frames.
+    let mut nowhere = Some(vec![0.0; split.validation.len()]);
     for group_recipe in &trial.recipe.groups {
         let descriptor = group_recipe.descriptor;
         on_step(Step::Fitting { descriptor: descriptor.name(), features: descriptor.dimensions() });
@@ -204,6 +210,10 @@ fn run_once(
             warnings: group.hyperparameters.warnings(),
         });
         let weight = group_recipe.weight as f32;
+        let of_group = queries.nowhere(&kept_group, &kept_field, &split.validation);
+        nowhere = nowhere.zip(of_group).map(|(sums, of_group): (Vec<f32>, _)| {
+            sums.iter().zip(of_group).map(|(sum, value)| sum + weight * value).collect()
+        });
         match &mut fused {
             None => fused = Some([all_test, kept_test, kept_validation].map(|likelihoods| likelihoods.scaled(weight))),
             Some(sums) => {
@@ -215,9 +225,14 @@ fn run_once(
         groups.push(kept_group);
         on_step(Step::Done);
     }
-    let temperature = fused.as_ref().and_then(|[_, _, kept_validation]| {
-        let rows: Vec<&[f32]> = kept_validation.values.chunks_exact(kept_validation.cells).collect();
-        fit_temperature(&cells, &rows, &queries.validation_m)
+    let rows: Vec<&[f32]> = fused.as_ref().map_or(Vec::new(), |[_, _, kept_validation]| {
+        kept_validation.values.chunks_exact(kept_validation.cells).collect()
+    });
+    let temperature = fit_temperature(&cells, &rows, &queries.validation_m);
+    let least_resemblance = nowhere.and_then(|nowhere| {
+        let truth_m = &queries.validation_m;
+        let held_back = HeldBack { cells: &cells, log_likelihoods: &rows, nowhere: &nowhere, truth_m };
+        recognition::least_resemblance(&held_back, learning.spacing_m())
     });
     if let (Some([all_test, kept_test, kept_validation]), true) = (fused, outcomes.len() > 1) {
         let total = |of: fn(&Outcome) -> usize| -> usize { outcomes.iter().map(of).sum() };
@@ -235,7 +250,7 @@ fn run_once(
             warnings: BTreeMap::new(),
         });
     }
-    Ok(Outcomes { rows: outcomes, groups, learned_from: learning.len(), temperature })
+    Ok(Outcomes { rows: outcomes, groups, learned_from: learning.len(), temperature, least_resemblance })
 }
 
 /// −2 Σ L(θ_r) + 4 |Ω| log n: the reading of the Bayesian information criterion that fits the paper's tables, four
@@ -284,6 +299,12 @@ impl Queries<'_> {
     fn likelihoods(&self, group: &LearnedGroup, field: &FieldOnCells, rows: &[usize]) -> Likelihoods {
         let features = self.features(group, rows);
         log_likelihoods(field, &features, group.recipe.noise)
+    }
+
+    /// Log-likelihoods of no place.
+    fn nowhere(&self, group: &LearnedGroup, field: &FieldOnCells, rows: &[usize]) -> Option<Vec<f32>> {
+        let features = self.features(group, rows);
+        features.iter().map(|features| field.log_likelihood_nowhere(features, group.recipe.noise)).collect()
     }
 
     /// Features of the frames at `rows`, one vector a frame.

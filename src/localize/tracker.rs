@@ -1,0 +1,208 @@
+//! From one frame to the next: the discrete Bayes filter, and what may be said of its belief.
+
+use super::belief::{Belief, Mode};
+use super::motion::{ConstantVelocity, MotionModel, MotionSettings};
+use super::state::{Evidence, StateMachine};
+use crate::localize::{most_likely_cell, refined_m};
+use crate::map::{CandidateCells, Compass, FeatureMap};
+use crate::types::{
+    EstimateWarnings, EstimatedHeading, EstimatedPose, LocalizationState, NS_PER_S, PositionCovariance,
+    PositionEstimate, PositionM, distance_m,
+};
+
+/// What a frame says.
+#[derive(Debug, Clone, Copy)]
+pub struct Observation<'a> {
+    pub sequence: u32,
+    pub stamp_ns: u64,
+    /// Log-likelihood of every candidate cell, not yet divided by the map's temperature.
+    pub log_likelihood: &'a [f32],
+    /// The log-likelihood of a place the map knows nothing of; `None` where the map's recipe has none.
+    pub nowhere: Option<f32>,
+    /// The [signature](super::heading) of the panorama that headings are taken from.
+    pub compass: &'a [i8],
+}
+
+/// Errors of frames that follow each other within this time are the same error: together they count as one frame \[s\].
+const SAME_ERROR_S: f64 = 0.33;
+/// A frame of the same instant as the one before it is worth this.
+const LEAST_SHARE: f64 = 1e-3;
+/// Mixed into the belief with every frame: nothing is ruled out for good.
+const DOUBT: f64 = 1e-4;
+/// And after a frame that contradicts those before it.
+const DOUBT_IN_CONTRADICTION: f64 = 0.5;
+/// A frame fits the place of the belief if a cell within so many deviations, and at least so many steps, is likely.
+const FITTING_STDS: f64 = 3.0;
+const FITTING_STEPS: f64 = 3.0;
+/// Without a usable frame for so long, a position must be found anew \[s\].
+const BLIND_S: f64 = 1.5;
+/// The place of a frame is looked for by itself once the belief has so much of its probability in one hill.
+const TRACKED: f64 = 0.95;
+
+/// Follows a vehicle over the cells of a map.
+pub struct Tracker {
+    cells: CandidateCells,
+    refine: bool,
+    temperature: f64,
+    /// Variance on either axis that the positions of the map itself have.
+    map_variance_m2: f64,
+    compass: Option<Compass>,
+    belief: Belief,
+    motion: Box<dyn MotionModel>,
+    states: StateMachine,
+    last_stamp_ns: Option<u64>,
+    /// Of the last frame that was not skipped.
+    last_used_ns: Option<u64>,
+    /// What it was worth.
+    last_share: f64,
+    doubt: f64,
+}
+
+fn seconds(from_ns: u64, to_ns: u64) -> f64 {
+    to_ns.saturating_sub(from_ns) as f64 / NS_PER_S as f64
+}
+
+/// What a frame changed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tracked {
+    pub estimate: PositionEstimate,
+    /// The hill of the belief, whatever the state.
+    pub mode: Mode,
+    /// How much better the best place fits than none, in nats; `None` where the map cannot say.
+    pub resemblance: Option<f64>,
+}
+
+impl Tracker {
+    pub fn new(map: &FeatureMap, settings: MotionSettings) -> Self {
+        Self::with_motion(map, Box::new(ConstantVelocity::new(settings)))
+    }
+
+    /// With another model of the motion, such as one of odometry.
+    pub fn with_motion(map: &FeatureMap, motion: Box<dyn MotionModel>) -> Self {
+        Self {
+            cells: map.cells.clone(),
+            refine: map.info.refine,
+            temperature: map.info.temperature,
+            map_variance_m2: map.info.position_std_m().powi(2),
+            compass: map.compass.clone(),
+            belief: Belief::uniform(&map.cells),
+            motion,
+            states: StateMachine::new(map.info.least_resemblance),
+            last_stamp_ns: None,
+            last_used_ns: None,
+            last_share: 1.0,
+            doubt: DOUBT,
+        }
+    }
+
+    /// A frame that could not be used: only time has passed.
+    pub fn skip(&mut self, sequence: u32, stamp_ns: u64) -> PositionEstimate {
+        self.advance(stamp_ns);
+        let mode = self.belief.mode();
+        let state = self.states.state();
+        let pose = (state == LocalizationState::Localized).then(|| self.pose(&mode, &[]));
+        let warnings = EstimateWarnings { bad_frame: true, ..EstimateWarnings::default() };
+        PositionEstimate { sequence, stamp_ns, state, pose, single_frame_m: None, warnings }
+    }
+
+    /// Takes a frame. Stamps must not fall; one that does counts as no time having passed.
+    pub fn take(&mut self, frame: &Observation) -> Tracked {
+        self.advance(frame.stamp_ns);
+        // Frames that follow each other closely err alike; they share what one frame is worth.
+        let since_s = self.last_used_ns.map(|last| seconds(last, frame.stamp_ns));
+        let share = since_s.map_or(1.0, |since_s| (since_s / SAME_ERROR_S).clamp(LEAST_SHARE, 1.0));
+        self.last_used_ns = Some(frame.stamp_ns);
+        self.last_share = share;
+        self.belief.weigh(frame.log_likelihood, (share / self.temperature) as f32);
+        let mode = self.belief.mode();
+
+        let best = most_likely_cell(frame.log_likelihood);
+        let contradiction = self.contradiction(frame.log_likelihood, best, &mode);
+        let resemblance =
+            frame.nowhere.map(|nowhere| f64::from(frame.log_likelihood[best] - nowhere) / self.temperature);
+        let evidence = Evidence { probability: mode.probability, contradiction, resemblance, share };
+        let (state, warnings) = self.states.take(&evidence);
+        self.doubt = if warnings.contradiction { DOUBT_IN_CONTRADICTION } else { DOUBT };
+        self.follow(&mode);
+
+        let single_frame_m = match self.refine {
+            true => refined_m(&self.cells, frame.log_likelihood, best),
+            false => self.cells.center_m(best),
+        };
+        let pose = (state == LocalizationState::Localized).then(|| self.pose(&mode, frame.compass));
+        let (sequence, stamp_ns) = (frame.sequence, frame.stamp_ns);
+        let single_frame_m = Some(single_frame_m);
+        let estimate = PositionEstimate { sequence, stamp_ns, state, pose, single_frame_m, warnings };
+        Tracked { estimate, mode, resemblance }
+    }
+
+    /// The belief, for a smoother.
+    pub(super) fn belief(&self) -> &Belief {
+        &self.belief
+    }
+
+    /// What the last frame says by itself of the place around `position_m`.
+    pub(super) fn sighting(&self, position_m: PositionM) -> Mode {
+        self.belief.seen_near(position_m, (1.0 / self.last_share) as f32)
+    }
+
+    /// Moves the belief to the time of a frame, before what that frame says.
+    pub(super) fn advance(&mut self, stamp_ns: u64) {
+        let dt_s = self.last_stamp_ns.map_or(0.0, |last| seconds(last, stamp_ns));
+        self.last_stamp_ns = Some(stamp_ns);
+        if dt_s > 0.0 {
+            let motion = self.motion.predict(dt_s);
+            self.belief.spread(motion.mean_m, motion.std_m);
+        }
+        self.belief.doubt(self.doubt);
+        if self.last_used_ns.is_some_and(|last| seconds(last, stamp_ns) > BLIND_S) {
+            self.states.lose();
+        }
+    }
+
+    /// How much likelier the frame finds its best cell than any near the belief's hill, in nats.
+    fn contradiction(&self, log_likelihood: &[f32], best: usize, mode: &Mode) -> f64 {
+        let PositionCovariance { ee_m2, nn_m2, .. } = mode.covariance;
+        let reach_m = (FITTING_STDS * ee_m2.max(nn_m2).sqrt()).max(FITTING_STEPS * self.cells.grid.step_m);
+        if distance_m(self.cells.center_m(best), mode.mean_m) <= reach_m {
+            return 0.0;
+        }
+        let near = |cell: &usize| distance_m(self.cells.center_m(*cell), mode.mean_m) <= reach_m;
+        let here = (0..log_likelihood.len()).filter(near).map(|cell| log_likelihood[cell]).reduce(f32::max);
+        let best = log_likelihood[best];
+        here.map_or(f64::INFINITY, |here| f64::from(best - here) / self.temperature)
+    }
+
+    /// Tells the model of the motion what this frame says of the place.
+    fn follow(&mut self, mode: &Mode) {
+        if mode.probability < TRACKED {
+            return self.motion.observe(None);
+        }
+        let seen = self.sighting(mode.mean_m);
+        let PositionCovariance { ee_m2, en_m2, nn_m2 } = seen.covariance;
+        let [ee_m2, en_m2, nn_m2] = [ee_m2, en_m2, nn_m2].map(|variance_m2| variance_m2 / self.last_share);
+        self.motion.observe(Some(&Mode { covariance: PositionCovariance { ee_m2, en_m2, nn_m2 }, ..seen }));
+    }
+
+    fn pose(&self, mode: &Mode, compass: &[i8]) -> EstimatedPose {
+        EstimatedPose {
+            position_m: mode.mean_m,
+            covariance: self.with_map_error(mode.covariance),
+            velocity_mps: self.motion.velocity_mps(),
+            heading: self.heading(mode.mean_m, compass),
+        }
+    }
+
+    pub(super) fn with_map_error(&self, covariance: PositionCovariance) -> PositionCovariance {
+        PositionCovariance {
+            ee_m2: covariance.ee_m2 + self.map_variance_m2,
+            nn_m2: covariance.nn_m2 + self.map_variance_m2,
+            ..covariance
+        }
+    }
+
+    /// The heading of a panorama with this signature at about `position_m`, if the map has a compass.
+    pub fn heading(&self, position_m: PositionM, signature: &[i8]) -> Option<EstimatedHeading> {
+        self.compass.as_ref()?.heading(signature, position_m)
+    }
+}
