@@ -13,7 +13,7 @@ use super::survey::{
     read_to_match, read_truth,
 };
 use super::{BadArgument, DONE, print};
-use crate::evaluate::{Entry, LEGEND, against_map, table};
+use crate::evaluate::{Entry, LEGEND, SequenceFigures, against_map, table};
 use crate::features::Descriptor;
 use crate::map::{FeatureMap, Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
 use crate::metrics::{ErrorFigures, component_median};
@@ -146,16 +146,37 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
         };
         progress.finish();
         print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
-        if let Some(covered) = entries.iter().find_map(|entry| entry.coverage_95) {
-            print(&format!(
-                "The region that the map gives 95 % holds the true position in {:.1} % of the frames.\n",
-                100.0 * covered
-            ))?;
-        }
+        print(&in_words(&entries))?;
         all.extend(entries);
     }
     print(&format!("\n{LEGEND}"))?;
     Ok(all)
+}
+
+/// What a table has no columns for: how far the estimates against a map may be trusted.
+fn in_words(entries: &[Entry]) -> String {
+    let mut text = String::new();
+    for entry in entries {
+        let Some(covered) = entry.coverage_95 else { continue };
+        text += &format!(
+            "{}: the region of 95 % holds the true position in {:.1} % of the frames",
+            entry.estimator,
+            100.0 * covered
+        );
+        if let Some(nees) = entry.nees_mean {
+            text += &format!(", mean NEES {nees:.2} (2 is exact)");
+        }
+        if let Some(heading_deg) = entry.heading_median_deg {
+            text += &format!("; heading off by {heading_deg:.1} deg (median)");
+        }
+        if let (Some(share), Some(s), Some(m)) =
+            (entry.localized_share, entry.first_localized_s, entry.first_localized_m)
+        {
+            text += &format!("; {:.1} % of the frames localized, first after {s:.1} s and {m:.1} m", 100.0 * share);
+        }
+        text += "\n";
+    }
+    text
 }
 
 /// Every frame of `recording` against a map.
@@ -191,7 +212,9 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
         ..Entry::default()
     };
     let know_nothing_m = component_median(&map.positions_m);
-    let mut entries: Vec<Entry> = against_map(&survey, &map, &truth_m)
+    let outcomes = against_map(&survey, &map, &truth_m);
+    let mut entries: Vec<Entry> = outcomes
+        .single
         .into_iter()
         .map(|outcome| {
             let entry = Entry {
@@ -208,6 +231,22 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
             if args.frames { entry.with_frames(&indices, &truth_m, &outcome.estimates_m) } else { entry }
         })
         .collect();
+    let stamps_ns: Vec<u64> = survey.frames.iter().map(|frame| frame.stamp_ns).collect();
+    let yaws_rad: Vec<Option<f64>> = survey.frames.iter().map(|frame| frame.yaw_rad).collect();
+    for sequence in &outcomes.sequences {
+        let said = sequence.poses.iter().zip(&truth_m).filter_map(|(pose, truth_m)| Some((pose.as_ref()?, *truth_m)));
+        let (estimates_m, said_truth_m): (Vec<_>, Vec<_>) = said.map(|(pose, truth)| (pose.position_m, truth)).unzip();
+        let figures = SequenceFigures::of(sequence, &stamps_ns, &truth_m, &yaws_rad);
+        let entry = Entry {
+            recipe: Some(map.info.recipe.name()),
+            features: sequence.estimator.into(),
+            estimator: sequence.estimator,
+            ..base.clone()
+        };
+        let entry = entry.with_figures(ErrorFigures::of(&estimates_m, &said_truth_m, know_nothing_m));
+        let entry = figures.map_or(entry.clone(), |figures| entry.with_sequence(&figures));
+        entries.push(if args.frames { entry.with_poses(&indices, &truth_m, sequence) } else { entry });
+    }
     entries.push(median_entry(base, &map.positions_m, &truth_m));
     Ok(entries)
 }

@@ -124,7 +124,8 @@ pub fn read_to_learn(
 ) -> anyhow::Result<Survey> {
     let descriptors = recipes.iter().flat_map(Recipe::descriptors).collect();
     let perturbed = recipes.iter().flat_map(Recipe::perturbed).collect();
-    read(recordings, descriptors, perturbed, fixed, progress)
+    // A panorama that is turned by its yaw says nothing of the heading.
+    read(recordings, descriptors, perturbed, fixed, !fixed, progress)
 }
 
 /// Reads what matching all frames against a map with these `descriptors` needs.
@@ -133,7 +134,7 @@ pub fn read_to_match(
     descriptors: Vec<Descriptor>,
     progress: &Progress,
 ) -> anyhow::Result<Survey> {
-    read(std::slice::from_ref(recording), descriptors, Vec::new(), false, progress)
+    read(std::slice::from_ref(recording), descriptors, Vec::new(), false, true, progress)
 }
 
 fn read(
@@ -141,11 +142,12 @@ fn read(
     mut descriptors: Vec<Descriptor>,
     perturbed: Vec<Descriptor>,
     fixed: bool,
+    compass: bool,
     progress: &Progress,
 ) -> anyhow::Result<Survey> {
     descriptors.sort_unstable();
     descriptors.dedup();
-    let options = SurveyOptions { descriptors, fixed, repetitions: PERTURBED_COPIES, perturbed, seed: 0 };
+    let options = SurveyOptions { descriptors, fixed, compass, repetitions: PERTURBED_COPIES, perturbed, seed: 0 };
     let frames = recordings.iter().map(|recording| recording.survey.len()).sum();
     progress.begin(if fixed { "reading frames, turned by their yaw" } else { "reading frames" }, frames);
     Ok(Survey::read(recordings, &options, |frames| progress.advance(frames))?)

@@ -2,7 +2,9 @@
 
 use rayon::prelude::*;
 
-use crate::localize::FieldOnCells;
+use super::sequence::{Sequence, sequences};
+use crate::features::COMPASS_BYTES;
+use crate::localize::{FieldOnCells, Observation};
 use crate::map::FeatureMap;
 use crate::train::{Survey, covers, locate};
 use crate::types::PositionM;
@@ -20,9 +22,17 @@ pub struct MapOutcome {
     pub coverage_95: Option<f64>,
 }
 
-/// Estimates for every frame of `survey`, which in truth are at `truth_m`: one outcome a group, and one of all groups
-/// fused if there are several.
-pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> Vec<MapOutcome> {
+/// What became of a drive on a map.
+#[derive(Debug, Clone)]
+pub struct AgainstMap {
+    /// Frames on their own: one outcome a group, and one of all groups fused if there are several.
+    pub single: Vec<MapOutcome>,
+    /// The frames one after the other; empty where they have no time.
+    pub sequences: Vec<Sequence>,
+}
+
+/// Estimates for every frame of `survey`, which in truth are at `truth_m`.
+pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> AgainstMap {
     let fields: Vec<FieldOnCells> = map.groups.iter().map(FieldOnCells::of).collect();
     let rows: Vec<usize> = (0..survey.len()).collect();
     let features: Vec<_> = map
@@ -34,11 +44,12 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
         .collect();
 
     // Per frame: an estimate a group, and the fused one last.
-    let (estimates_m, covered): (Vec<Vec<PositionM>>, Vec<bool>) = rows
+    let answers: Vec<Answer> = rows
         .par_iter()
         .map_init(Vec::new, |scratch, &row| {
             let mut fused = vec![0.0; map.cells.len()];
-            let mut of_frame: Vec<PositionM> = fields
+            let mut nowhere = Some(0.0);
+            let mut estimates_m: Vec<PositionM> = fields
                 .iter()
                 .zip(&map.info.groups)
                 .zip(&features)
@@ -47,16 +58,19 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
                     let mut alone = vec![0.0; map.cells.len()];
                     field.add_log_likelihood(&z, info.recipe.noise, info.recipe.weight as f32, scratch, &mut alone);
                     fused.iter_mut().zip(&alone).for_each(|(sum, value)| *sum += value);
+                    let of_group = field.log_likelihood_nowhere(&z, info.recipe.noise);
+                    nowhere = nowhere.zip(of_group).map(|(sum, value)| sum + info.recipe.weight as f32 * value);
                     locate(&map.cells, &alone, map.info.refine)
                 })
                 .collect();
-            of_frame.push(locate(&map.cells, &fused, map.info.refine));
-            (of_frame, covers(&map.cells, &fused, truth_m[row], map.info.temperature, 0.95))
+            estimates_m.push(locate(&map.cells, &fused, map.info.refine));
+            let is_covered = covers(&map.cells, &fused, truth_m[row], map.info.temperature, 0.95);
+            Answer { estimates_m, is_covered, log_likelihood: fused, nowhere }
         })
-        .unzip();
-    let covered = covered.iter().filter(|&&covered| covered).count() as f64 / survey.len().max(1) as f64;
+        .collect();
+    let covered = answers.iter().filter(|answer| answer.is_covered).count() as f64 / survey.len().max(1) as f64;
 
-    let column = |i: usize| estimates_m.iter().map(|of_frame| of_frame[i]).collect();
+    let column = |i: usize| answers.iter().map(|answer| answer.estimates_m[i]).collect();
     let mut outcomes: Vec<MapOutcome> = map
         .info
         .groups
@@ -82,5 +96,38 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
             coverage_95: Some(covered),
         });
     }
-    outcomes
+    AgainstMap { single: outcomes, sequences: in_order(survey, map, &answers) }
+}
+
+/// One frame on its own.
+struct Answer {
+    /// One a group, and the fused one last.
+    estimates_m: Vec<PositionM>,
+    is_covered: bool,
+    log_likelihood: Vec<f32>,
+    nowhere: Option<f32>,
+}
+
+/// The frames one after the other, if it is known when they were taken.
+fn in_order(survey: &Survey, map: &FeatureMap, answers: &[Answer]) -> Vec<Sequence> {
+    let are_timed = survey.frames.iter().all(|frame| frame.time_s.is_some());
+    let in_order = survey.frames.windows(2).all(|pair| pair[0].stamp_ns <= pair[1].stamp_ns);
+    if !are_timed || !in_order {
+        return Vec::new();
+    }
+    let compasses = survey.compass().chunks_exact(COMPASS_BYTES).map(Some).chain(std::iter::repeat(None));
+    let frames: Vec<Observation> = survey
+        .frames
+        .iter()
+        .zip(answers)
+        .zip(compasses)
+        .map(|((frame, answer), compass)| Observation {
+            sequence: frame.index as u32,
+            stamp_ns: frame.stamp_ns,
+            log_likelihood: &answer.log_likelihood,
+            nowhere: answer.nowhere,
+            compass: compass.unwrap_or(&[]),
+        })
+        .collect();
+    sequences(map, &frames).into()
 }

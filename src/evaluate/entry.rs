@@ -2,8 +2,9 @@
 
 use serde::Serialize;
 
+use super::sequence::{Sequence, SequenceFigures};
 use crate::metrics::ErrorFigures;
-use crate::types::PositionM;
+use crate::types::{LocalizationState, PositionM};
 
 /// One row of the evaluation. The names are a contract with scripts: keys are added, never renamed; `null` where a
 /// figure has no meaning.
@@ -37,6 +38,10 @@ pub struct Entry {
     pub share_over_10m: Option<f64>,
     pub skill: Option<f64>,
     pub heading_median_deg: Option<f64>,
+    /// Share of the test frames that have an estimate; the first of them, since the first frame.
+    pub localized_share: Option<f64>,
+    pub first_localized_s: Option<f64>,
+    pub first_localized_m: Option<f64>,
     pub nees_mean: Option<f64>,
     pub coverage_95: Option<f64>,
     pub bic_all: Option<f64>,
@@ -51,8 +56,9 @@ pub struct FrameEntry {
     pub index: usize,
     pub truth_e_m: f64,
     pub truth_n_m: f64,
-    pub est_e_m: f64,
-    pub est_n_m: f64,
+    /// `None` where no position is said.
+    pub est_e_m: Option<f64>,
+    pub est_n_m: Option<f64>,
     pub cov_ee_m2: Option<f64>,
     pub cov_en_m2: Option<f64>,
     pub cov_nn_m2: Option<f64>,
@@ -81,13 +87,44 @@ impl Entry {
             index,
             truth_e_m: truth_m[0],
             truth_n_m: truth_m[1],
-            est_e_m: estimate_m[0],
-            est_n_m: estimate_m[1],
+            est_e_m: Some(estimate_m[0]),
+            est_n_m: Some(estimate_m[1]),
             cov_ee_m2: None,
             cov_en_m2: None,
             cov_nn_m2: None,
             heading_rad: None,
             state: None,
+        });
+        Self { frames: Some(frames.collect()), ..self }
+    }
+
+    /// The figures of a drive as a whole.
+    pub fn with_sequence(self, figures: &SequenceFigures) -> Self {
+        Self {
+            heading_median_deg: figures.heading_median_deg,
+            localized_share: Some(figures.share),
+            first_localized_s: Some(figures.first_s),
+            first_localized_m: Some(figures.first_m),
+            nees_mean: Some(figures.nees_mean),
+            coverage_95: Some(figures.coverage_95),
+            ..self
+        }
+    }
+
+    /// The frames with the poses of a drive.
+    pub fn with_poses(self, indices: &[usize], truth_m: &[PositionM], sequence: &Sequence) -> Self {
+        let frames = indices.iter().zip(truth_m).zip(sequence.poses.iter().zip(&sequence.states));
+        let frames = frames.map(|((&index, truth_m), (pose, state))| FrameEntry {
+            index,
+            truth_e_m: truth_m[0],
+            truth_n_m: truth_m[1],
+            est_e_m: pose.map(|pose| pose.position_m[0]),
+            est_n_m: pose.map(|pose| pose.position_m[1]),
+            cov_ee_m2: pose.map(|pose| pose.covariance.ee_m2),
+            cov_en_m2: pose.map(|pose| pose.covariance.en_m2),
+            cov_nn_m2: pose.map(|pose| pose.covariance.nn_m2),
+            heading_rad: pose.and_then(|pose| pose.heading).map(|heading| heading.yaw_rad),
+            state: state.map(LocalizationState::name),
         });
         Self { frames: Some(frames.collect()), ..self }
     }
@@ -264,6 +301,9 @@ mod tests {
             "share_over_10m",
             "skill",
             "heading_median_deg",
+            "localized_share",
+            "first_localized_s",
+            "first_localized_m",
             "nees_mean",
             "coverage_95",
             "bic_all",

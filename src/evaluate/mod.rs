@@ -2,6 +2,8 @@
 
 mod against_map;
 mod entry;
+mod sequence;
 
-pub use against_map::{MapOutcome, against_map};
+pub use against_map::{AgainstMap, MapOutcome, against_map};
 pub use entry::{Entry, FrameEntry, LEGEND, table};
+pub use sequence::{Sequence, SequenceFigures, SequencePose};
