@@ -11,6 +11,7 @@ pub mod frame_source;
 pub mod import;
 pub mod info;
 pub mod journal;
+pub mod localize;
 pub mod man;
 pub mod map_report;
 pub mod mark;
@@ -54,6 +55,7 @@ pub struct Cli {
 pub enum Command {
     Demo(demo::Args),
     Record(record::Args),
+    Localize(localize::Args),
     Replay(replay::Args),
     Import(import::Args),
     Calibrate(calibrate::CalibrateArgs),
@@ -74,6 +76,7 @@ impl Command {
         match self {
             Self::Demo(args) => demo::run(args),
             Self::Record(args) => record::run(args),
+            Self::Localize(args) => localize::run(args),
             Self::Replay(args) => replay::run(args),
             Self::Import(args) => import::run(args),
             Self::Calibrate(args) => calibrate::run(args),
@@ -105,6 +108,17 @@ pub fn print(text: &str) -> io::Result<()> {
             outcome.map_err(|error| io::Error::new(error.kind(), format!("writing the results to stdout: {error}")))
         }
     }
+}
+
+/// An error with all that it came from, on one line.
+pub fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text += &format!(": {error}");
+        cause = error.source();
+    }
+    text
 }
 
 /// Text from a file must not steer the terminal.

@@ -2,7 +2,7 @@
 
 use std::{path::PathBuf, process::ExitCode};
 
-use super::{BadArgument, DATA_LOST, DONE, journal, print};
+use super::{BadArgument, DATA_LOST, DONE, chain, journal, print};
 use crate::{
     config::{Camera, RecordConfig},
     recording::proto::omniloc::Status,
@@ -46,16 +46,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 pub fn finish(report: &DriveReport) -> anyhow::Result<ExitCode> {
     print(&summary(report))?;
     Ok(if report.is_lossless() { DONE } else { DATA_LOST }.into())
-}
-
-fn chain(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        text += &format!(": {error}");
-        cause = error.source();
-    }
-    text
 }
 
 /// The state on one line.

@@ -30,7 +30,7 @@ use crate::{
 };
 
 /// Where the clocks of a simulated drive start: a computer that was switched on a while ago.
-const SIMULATED_START: ClockReading =
+pub const SIMULATED_START: ClockReading =
     ClockReading { monotonic_ns: 100 * NS_PER_S, realtime_ns: 1_790_000_000 * NS_PER_S as i64 };
 /// A simulated drive begins so long after the clocks start: what everything needs to be ready [s in real time], but at
 /// most what a receiver may be silent for [s of the clock].
@@ -56,11 +56,8 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
     }
 
     // A camera renders its world first, which takes a while: the clocks start when it is ready.
-    let mut camera = simulated_camera(config, simulation.as_ref())?;
-    let clock: Arc<dyn Clock> = match start {
-        Some(start) => Arc::new(scaled_clock(start, speed, simulation.as_ref().map(|(simulation, _)| simulation))),
-        None => Arc::new(SystemClock),
-    };
+    let camera = camera(&config.camera, simulation.as_ref())?;
+    let clock = clock(start, speed, simulation.as_ref().map(|(simulation, _)| simulation));
 
     let boot_id = boot_id();
     let mut head = Head::new(&config.resolved(), &config.vehicle.name, &boot_id, clock.read());
@@ -87,14 +84,8 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
     let line = gnss(config, simulation.as_ref(), ports.path(), &clock, &stop)?;
     let (gnss, player) = line.map_or((None, None), |line| (Some(line.driver), line.player));
     let led = Led::default();
-    let devices = Devices {
-        camera: match camera.take() {
-            Some(camera) => Some(camera),
-            None => real_or_replayed_camera(config)?,
-        },
-        gnss,
-        gpio: pins(config, simulation.as_ref().map(|(simulation, _)| simulation), &led)?,
-    };
+    let devices =
+        Devices { camera, gnss, gpio: pins(config, simulation.as_ref().map(|(simulation, _)| simulation), &led)? };
     let settings = DriveSettings {
         decoder: config.decoder.clone(),
         sync: config.sync.clone(),
@@ -121,27 +112,35 @@ pub fn simulate(settings: &simulated::Settings) -> (Simulation, World) {
     (Simulation::new(settings, &world, start_ns, SIMULATED_START.realtime_ns), world)
 }
 
-fn simulated_camera(
-    config: &RecordConfig,
+/// The camera, if there is one.
+pub fn camera(
+    camera: &Camera,
     simulation: Option<&(Simulation, &World)>,
 ) -> anyhow::Result<Option<DeviceRun<CameraEvent>>> {
-    let (Camera::Simulated, Some((simulation, world))) = (&config.camera, simulation) else { return Ok(None) };
-    let mut camera = simulation.camera(world)?;
-    Ok(Some(Box::new(move |clock, stop, emit| camera.run(clock, stop, emit))))
-}
-
-fn real_or_replayed_camera(config: &RecordConfig) -> anyhow::Result<Option<DeviceRun<CameraEvent>>> {
-    Ok(match &config.camera {
-        Camera::V4l2(settings) => {
+    Ok(match (camera, simulation) {
+        (Camera::V4l2(settings), _) => {
             let settings = settings.clone();
             Some(Box::new(move |clock, stop, emit| camera_v4l2::run(&settings, clock, stop, emit)))
         }
-        Camera::Replay(replay) => {
+        (Camera::Replay(replay), _) => {
             let mut camera = ReplayCamera::open(&replay.recording, camera_facts(&replay.recording)?)?;
             Some(Box::new(move |clock, stop, emit| camera.run(clock, stop, emit)))
         }
-        Camera::Simulated | Camera::None => None,
+        (Camera::Simulated, Some((simulation, world))) => {
+            let mut camera = simulation.camera(world)?;
+            Some(Box::new(move |clock, stop, emit| camera.run(clock, stop, emit)))
+        }
+        (Camera::Simulated, None) => unreachable!("a simulated driver needs [simulation]: checked when it was loaded"),
+        (Camera::None, _) => None,
     })
+}
+
+/// The clocks of a drive: the computer's, or those of a `start` in a recording or a simulation.
+pub fn clock(start: Option<ClockReading>, speed: f64, simulation: Option<&Simulation>) -> Arc<dyn Clock> {
+    match start {
+        Some(start) => Arc::new(scaled_clock(start, speed, simulation)),
+        None => Arc::new(SystemClock),
+    }
 }
 
 /// A serial line, and the thread that plays a simulated or replayed receiver into it.

@@ -11,11 +11,13 @@
 //! [`live::STOP_LIMIT`].
 //!
 //! `drive` puts a drive together, `live` runs it, `supervisor` keeps each device running, and `survey` is what becomes
-//! of what they say; `playback` takes a recorded drive through the same survey without any clock.
+//! of what they say; `playback` takes a recorded drive through the same survey without any clock. `localize` is the same
+//! for drives that are localized.
 
 mod complaints;
 pub mod drive;
 pub mod live;
+pub mod localize;
 pub mod playback;
 mod status;
 mod supervisor;

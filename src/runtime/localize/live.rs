@@ -1,0 +1,294 @@
+//! A live drive: from a configuration to positions.
+
+use std::{
+    fs, io,
+    os::unix::fs::MetadataExt,
+    path::{Path, PathBuf},
+    sync::{Arc, Mutex, PoisonError},
+    thread::JoinHandle,
+    time::Duration,
+};
+
+use anyhow::Context;
+use tokio::{
+    select,
+    signal::unix::{SignalKind, signal},
+    time::MissedTickBehavior,
+};
+use tracing::{info, warn};
+
+use super::{
+    newest::Newest,
+    session::{Counts, LensError, Session},
+};
+use crate::{
+    config::{Camera, LocalizeConfig},
+    devices::{CameraEvent, Stop},
+    localize::Timings,
+    map::{FeatureMap, file},
+    outputs::{OutputReport, Outputs},
+    runtime::{
+        drive::{self, SIMULATED_START},
+        live::DeviceRun,
+        supervisor::{self, supervise},
+        system::{SystemMonitor, SystemStatus},
+    },
+    types::{Clock, PositionEstimate},
+};
+
+/// Part of the time to stop that the camera and the localizer have.
+const STOP_LIMIT: Duration = Duration::from_secs(3);
+/// Realtime before this, 2020, is that of a computer without a battery clock that has not been told the date.
+const LEAST_REALTIME_NS: i64 = 1_577_836_800_000_000_000;
+
+/// How it goes, once a second.
+#[derive(Debug, Clone, Default)]
+pub struct LocalizeStatus {
+    /// `ok`, or a word for what is wrong.
+    pub camera_health: &'static str,
+    pub counts: Counts,
+    /// Frames that came faster than they could be looked at.
+    pub passed_over: u64,
+    pub frames_per_s: f64,
+    pub last: Option<PositionEstimate>,
+    pub timings: Timings,
+    pub system: SystemStatus,
+}
+
+/// How it ended.
+#[derive(Debug)]
+pub struct LocalizeReport {
+    pub status: LocalizeStatus,
+    pub outputs: Vec<OutputReport>,
+}
+
+/// What the localizer's thread tells the rest.
+#[derive(Debug, Default)]
+struct Shared {
+    counts: Counts,
+    last: Option<PositionEstimate>,
+    timings: Timings,
+    /// Why it has ended before it was told to.
+    error: Option<LensError>,
+}
+
+/// Localizes as `config` says, until it is told to stop or the camera ends as a replay does; `each_second` is told the
+/// status.
+pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus)) -> anyhow::Result<LocalizeReport> {
+    let map = read_map(&config.map.file)?;
+    let watched = MapWatch::new(&config.map.file);
+    let outputs = Outputs::start(&config.outputs, map.info.origin)?;
+    let session = Session::new(map, config.motion).with_context(|| config.map.file.display().to_string())?;
+    let simulated = config.simulation.as_ref().map(drive::simulate);
+    let simulation = simulated.as_ref().map(|(simulation, world)| (simulation.clone(), world));
+    // A camera renders its world first, which takes a while: the clocks start when it is ready.
+    let camera = drive::camera(&config.camera, simulation.as_ref())?.context("there is no camera to localize with")?;
+    let start = match &config.camera {
+        Camera::Simulated => Some(SIMULATED_START),
+        Camera::Replay(replay) => Some(drive::first_clocks(&replay.recording)?),
+        _ => None,
+    };
+    let speed = config.simulation.as_ref().map_or(1.0, |simulation| simulation.speed) * config.replay_speed;
+    let clock = drive::clock(start, speed, simulation.as_ref().map(|(simulation, _)| simulation));
+
+    let frames = Arc::new(Newest::default());
+    let shared = Arc::<Mutex<Shared>>::default();
+    let health = Arc::new(Mutex::new("starting"));
+    let stop = Stop::default();
+    let camera = start_camera(camera, &frames, &health, &clock, &stop)?;
+    let outputs = Arc::new(outputs);
+    let localizer = start_localizer(session, &frames, &shared, &outputs, &clock)?;
+
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("starting the runtime")?;
+    let second = Duration::from_secs_f64(1.0 / speed);
+    let mut watch = Watch { frames, shared, health, map: watched, system: SystemMonitor::default(), clock };
+    let outcome = runtime.block_on(until_stopped(&mut watch, second, &localizer, each_second));
+
+    stop.stop();
+    join_within(&camera, STOP_LIMIT);
+    watch.frames.close();
+    join_within(&localizer, STOP_LIMIT);
+    outcome?;
+    let status = watch.status(0.0);
+    let error = watch.shared().error.take();
+    // The localizer's thread has its own handle; once that has ended this is the last.
+    let outputs = Arc::try_unwrap(outputs).map_or_else(|outputs| outputs.reports(), Outputs::finish);
+    match error {
+        Some(error) => Err(error).with_context(|| config.map.file.display().to_string()),
+        None => Ok(LocalizeReport { status, outputs }),
+    }
+}
+
+/// Reads a map.
+pub fn read_map(path: &Path) -> anyhow::Result<FeatureMap> {
+    let context = || format!("loading the map {}", path.display());
+    let reader = fs::File::open(path).with_context(context)?;
+    file::read(reader).with_context(context)
+}
+
+fn start_camera(
+    mut camera: DeviceRun<CameraEvent>,
+    frames: &Arc<Newest>,
+    health: &Arc<Mutex<&'static str>>,
+    clock: &Arc<dyn Clock>,
+    stop: &Stop,
+) -> anyhow::Result<JoinHandle<()>> {
+    let (to, ended, health, well) = (frames.clone(), frames.clone(), health.clone(), health.clone());
+    let run = move |clock: &dyn Clock, stop: &Stop| {
+        camera(clock, stop, &mut |event| {
+            *lock(&well) = "ok";
+            to.push(event);
+        })
+    };
+    let report = move |outcome| match outcome {
+        supervisor::Outcome::Failed { health: word } => *lock(&health) = word,
+        supervisor::Outcome::Ended => {
+            *lock(&health) = "ended";
+            ended.close();
+        }
+    };
+    supervise("camera", clock.clone(), stop.clone(), run, report).context("starting the thread camera")
+}
+
+fn start_localizer(
+    mut session: Session,
+    frames: &Arc<Newest>,
+    shared: &Arc<Mutex<Shared>>,
+    outputs: &Arc<Outputs>,
+    clock: &Arc<dyn Clock>,
+) -> anyhow::Result<JoinHandle<()>> {
+    let (frames, shared, outputs, clock) = (frames.clone(), shared.clone(), outputs.clone(), clock.clone());
+    let run = move || {
+        while let Some(event) = frames.next() {
+            match session.take(&event) {
+                Ok(Some(estimate)) => outputs.send(&estimate, utc_ns(&*clock, estimate.stamp_ns)),
+                Ok(None) => {}
+                Err(error) => {
+                    lock(&shared).error = Some(error);
+                    return;
+                }
+            }
+            let mut shared = lock(&shared);
+            (shared.counts, shared.last) = (session.counts(), session.last().copied());
+            shared.timings = *session.timings();
+        }
+    };
+    std::thread::Builder::new().name("localizer".into()).spawn(run).context("starting the thread localizer")
+}
+
+/// UTC of a stamp by the computer's clock, if it has been told the date.
+fn utc_ns(clock: &dyn Clock, stamp_ns: u64) -> Option<i64> {
+    let now = clock.read();
+    let utc_ns = now.realtime_ns - (now.monotonic_ns as i64 - stamp_ns as i64);
+    (utc_ns >= LEAST_REALTIME_NS).then_some(utc_ns)
+}
+
+/// What is looked at once a second.
+struct Watch {
+    frames: Arc<Newest>,
+    shared: Arc<Mutex<Shared>>,
+    health: Arc<Mutex<&'static str>>,
+    map: MapWatch,
+    system: SystemMonitor,
+    clock: Arc<dyn Clock>,
+}
+
+impl Watch {
+    fn shared(&self) -> std::sync::MutexGuard<'_, Shared> {
+        lock(&self.shared)
+    }
+
+    fn status(&mut self, frames_per_s: f64) -> LocalizeStatus {
+        let system = self.system.look(self.clock.monotonic_ns());
+        let shared = self.shared();
+        LocalizeStatus {
+            camera_health: *lock(&self.health),
+            counts: shared.counts,
+            passed_over: self.frames.passed_over(),
+            frames_per_s,
+            last: shared.last,
+            timings: shared.timings,
+            system,
+        }
+    }
+}
+
+async fn until_stopped(
+    watch: &mut Watch,
+    second: Duration,
+    localizer: &JoinHandle<()>,
+    mut each_second: impl FnMut(&LocalizeStatus),
+) -> anyhow::Result<()> {
+    let mut terminate = signal(SignalKind::terminate()).context("listening for SIGTERM")?;
+    let mut interrupt = signal(SignalKind::interrupt()).context("listening for SIGINT")?;
+    let mut hangup = signal(SignalKind::hangup()).context("listening for SIGHUP")?;
+    let mut seconds = tokio::time::interval(second);
+    seconds.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut frames_before = 0;
+    loop {
+        select! {
+            _ = seconds.tick() => {
+                watch.map.look();
+                let frames = watch.shared().counts.frames;
+                let status = watch.status((frames - frames_before) as f64);
+                frames_before = frames;
+                each_second(&status);
+                if localizer.is_finished() {
+                    info!("all frames are done with");
+                    return Ok(());
+                }
+            }
+            _ = terminate.recv() => { info!(signal = "SIGTERM", "stopping"); return Ok(()); }
+            _ = interrupt.recv() => { info!(signal = "SIGINT", "stopping"); return Ok(()); }
+            _ = hangup.recv() => { info!(signal = "SIGHUP", "stopping"); return Ok(()); }
+        }
+    }
+}
+
+/// Waits for a thread; one that hangs in a driver is left behind, and said so.
+fn join_within(thread: &JoinHandle<()>, limit: Duration) {
+    const POLL: Duration = Duration::from_millis(5);
+    let deadline = std::time::Instant::now() + limit;
+    while !thread.is_finished() && std::time::Instant::now() < deadline {
+        std::thread::sleep(POLL);
+    }
+    if !thread.is_finished() {
+        warn!(thread = thread.thread().name().unwrap_or("?"), "does not stop; leaving it behind");
+    }
+}
+
+/// Notices when the file of the map is changed: what runs is the map as it was read.
+struct MapWatch {
+    path: PathBuf,
+    facts: Option<[u64; 4]>,
+}
+
+impl MapWatch {
+    fn new(path: &Path) -> Self {
+        Self { path: path.into(), facts: facts(path).ok() }
+    }
+
+    fn look(&mut self) {
+        let now = facts(&self.path);
+        if now.as_ref().ok() == self.facts.as_ref() {
+            return;
+        }
+        match &now {
+            Ok(_) => warn!(map = %self.path.display(), "the map's file was changed: start again to use it"),
+            Err(error) => {
+                warn!(map = %self.path.display(), %error, "the map's file is gone: going on with what was read")
+            }
+        }
+        self.facts = now.ok();
+    }
+}
+
+/// What changes with a file.
+fn facts(path: &Path) -> io::Result<[u64; 4]> {
+    let facts = fs::metadata(path)?;
+    Ok([facts.ino(), facts.len(), facts.mtime() as u64, facts.mtime_nsec() as u64])
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

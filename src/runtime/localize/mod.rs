@@ -1,0 +1,17 @@
+//! Localizing: the camera's thread, the localizer's thread, and outputs that nobody waits for.
+//!
+//! ```text
+//! camera thread ─► the newest frames ─► localizer thread ─► outputs (a thread each)
+//!                                             └─► status line, journal
+//! ```
+//!
+//! A frame that comes while older ones wait takes the place of the oldest: an estimate is of now. `session` is what a live
+//! and a replayed drive have in common.
+
+mod lens_check;
+pub mod live;
+mod newest;
+pub mod session;
+
+pub use live::{LocalizeReport, LocalizeStatus};
+pub use session::{Counts, LensError, Session};

@@ -1,0 +1,151 @@
+//! Frames become estimates: what a live drive and a replayed one do alike.
+
+use tracing::{info, warn};
+
+use super::lens_check::{LensCheck, LensVerdict};
+use crate::{
+    devices::{CameraEvent, CameraFrame},
+    localize::{Localizer, MotionSettings, Timings},
+    map::FeatureMap,
+    types::{EstimateWarnings, LocalizationState, PositionEstimate},
+};
+
+/// Localizes on one map, and keeps count.
+pub struct Session {
+    localizer: Localizer,
+    lens_check: Option<LensCheck>,
+    map: FeatureMap,
+    settings: MotionSettings,
+    counts: Counts,
+    last: Option<PositionEstimate>,
+}
+
+/// Since the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    pub frames: u64,
+    pub localized: u64,
+    /// Frames that could not be used.
+    pub unusable: u64,
+    /// Frames that the camera lost.
+    pub lost: u64,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum LensError {
+    #[error("the map is of another lens: {what}; train a map with this lens, or mount the one of the map")]
+    Other { what: String },
+    #[error("the lens cannot be where it is found")]
+    Calibration(#[from] crate::types::CalibrationError),
+}
+
+impl Session {
+    /// # Errors
+    /// When the map's donut does not lie within its images.
+    pub fn new(map: FeatureMap, settings: MotionSettings) -> Result<Self, LensError> {
+        Ok(Self {
+            localizer: Localizer::new(&map, &map.info.calibration, settings)?,
+            lens_check: Some(LensCheck::new(&map.info.calibration)),
+            map,
+            settings,
+            counts: Counts::default(),
+            last: None,
+        })
+    }
+
+    /// What the camera says; `Some` estimate after a frame.
+    ///
+    /// # Errors
+    /// When the camera looks through another lens than the map's.
+    pub fn take(&mut self, event: &CameraEvent) -> Result<Option<PositionEstimate>, LensError> {
+        match event {
+            CameraEvent::Opened(facts) => {
+                info!(camera = facts.name, width_px = facts.width_px, height_px = facts.height_px, "camera open");
+                // Whoever unplugged the camera may have turned the lens.
+                self.lens_check = Some(LensCheck::new(&self.map.info.calibration));
+                Ok(None)
+            }
+            CameraEvent::Lost(lost) => {
+                self.counts.lost += lost.count;
+                Ok(None)
+            }
+            CameraEvent::Frame(frame) => self.frame(frame).map(Some),
+        }
+    }
+
+    fn frame(&mut self, frame: &CameraFrame) -> Result<PositionEstimate, LensError> {
+        if frame.damage.is_none() {
+            self.check_lens(&frame.jpeg)?;
+        }
+        let (sequence, stamp_ns) = (frame.sequence, frame.stamp_ns);
+        let estimate = match frame.damage {
+            Some(_) => Err(self.localizer.skip(sequence, stamp_ns)),
+            None => match self.localizer.take(sequence, stamp_ns, &frame.jpeg) {
+                Ok(tracked) => Ok(tracked.estimate),
+                Err(_) => Err(self.localizer.skip(sequence, stamp_ns)),
+            },
+        };
+        self.counts.frames += 1;
+        self.counts.unusable += u64::from(estimate.is_err());
+        let estimate = self.held_back(estimate.unwrap_or_else(|skipped| skipped));
+        self.counts.localized += u64::from(estimate.pose.is_some());
+        self.tell(&estimate);
+        self.last = Some(estimate);
+        Ok(estimate)
+    }
+
+    fn check_lens(&mut self, jpeg: &[u8]) -> Result<(), LensError> {
+        let Some(verdict) = self.lens_check.as_mut().and_then(|check| check.look(jpeg)) else { return Ok(()) };
+        self.lens_check = None;
+        match verdict {
+            LensVerdict::Fits => {}
+            LensVerdict::Slipped { by_px: [x_px, y_px], calibration } => {
+                warn!(x_px, y_px, "the lens has slipped since the survey: the panorama is cut out where it is now");
+                self.localizer = Localizer::new(&self.map, &calibration, self.settings)?;
+            }
+            LensVerdict::Unclear(reason) => {
+                warn!(reason, "the lens could not be checked; going on with the map's calibration");
+            }
+            LensVerdict::Other(what) => return Err(LensError::Other { what }),
+        }
+        Ok(())
+    }
+
+    /// No position is said before the lens is known to be the map's.
+    fn held_back(&self, estimate: PositionEstimate) -> PositionEstimate {
+        match estimate.state {
+            LocalizationState::Localized if self.lens_check.is_some() => {
+                PositionEstimate { state: LocalizationState::Candidate, pose: None, ..estimate }
+            }
+            _ => estimate,
+        }
+    }
+
+    /// Changes of the state go into the log.
+    fn tell(&self, estimate: &PositionEstimate) {
+        let before = self.last.map_or(LocalizationState::Unknown, |last| last.state);
+        let (state, frame) = (estimate.state.name(), estimate.sequence);
+        match (estimate.state, before) {
+            (LocalizationState::Localized, before) if before != LocalizationState::Localized => {
+                info!(frame, state, "the position is known");
+            }
+            (LocalizationState::Lost, LocalizationState::Localized) => {
+                let EstimateWarnings { unlike_the_map, contradiction, .. } = estimate.warnings;
+                warn!(frame, state, unlike_the_map, contradiction, "the position is not known any more");
+            }
+            _ => {}
+        }
+    }
+
+    pub fn counts(&self) -> Counts {
+        self.counts
+    }
+
+    pub fn last(&self) -> Option<&PositionEstimate> {
+        self.last.as_ref()
+    }
+
+    pub fn timings(&self) -> &Timings {
+        self.localizer.timings()
+    }
+}
