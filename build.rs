@@ -7,13 +7,14 @@ use prost::Message;
 use protox::Compiler;
 
 /// Messages that are written to a topic; what they import comes along.
-const TOPIC_MESSAGES: [&str; 10] = [
+const TOPIC_MESSAGES: [&str; 11] = [
     "foxglove/CompressedImage",
     "foxglove/LocationFix",
     "foxglove/PoseInFrame",
     "omniloc/ClockOffset",
     "omniloc/Dropped",
     "omniloc/Heading",
+    "omniloc/PositionEstimate",
     "omniloc/Pulse",
     "omniloc/SerialChunk",
     "omniloc/Status",

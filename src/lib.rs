@@ -27,6 +27,7 @@
 //! | [`gp`] | Gaussian-process regression: pure mathematics |
 //! | [`map`] | what localizing needs to know of a place, and its file |
 //! | [`localize`] | features of one frame against the map |
+//! | [`outputs`] | estimates → JSON lines and NMEA sentences, to whoever listens |
 //! | [`train`] | recordings → map: recipes, splits, selection |
 //! | [`metrics`] | error figures of position estimates |
 //! | [`evaluate`] | the protocol's results and the paper's tables |
@@ -56,6 +57,7 @@ pub mod jpeg;
 pub mod localize;
 pub mod map;
 pub mod metrics;
+pub mod outputs;
 pub mod panorama;
 pub mod recording;
 pub mod runtime;

@@ -155,7 +155,7 @@ pub(super) fn read_line(
     emit(SerialEvent::Opened { port: settings.port.clone(), baud: announced_baud });
 
     while !stop.is_stopped() {
-        let read = line.read(&mut buffer).map_err(|source| read_error(device(), source))?;
+        let read = line.read(&mut buffer).map_err(|source| line_error(device(), source))?;
         let now_ns = clock.monotonic_ns();
         match read {
             Some(0) => return Err(DeviceError::Disconnected { device: device() }),
@@ -183,14 +183,14 @@ pub(super) fn read_line(
             _ => DeviceError::BadData { device: device(), what: what.to_string() },
         })?;
         if next != before {
-            line.set_baud(next).map_err(|source| read_error(device(), source))?;
+            line.set_baud(next).map_err(|source| line_error(device(), source))?;
         }
     }
     Ok(())
 }
 
 /// An unplugged device answers with one of several errors.
-fn read_error(device: String, source: io::Error) -> DeviceError {
+pub(crate) fn line_error(device: String, source: io::Error) -> DeviceError {
     use rustix::io::Errno;
     let is_gone = source
         .raw_os_error()
@@ -204,12 +204,12 @@ fn read_error(device: String, source: io::Error) -> DeviceError {
 }
 
 /// A serial port of this computer.
-struct Tty {
+pub(crate) struct Tty {
     port: TTYPort,
 }
 
 impl Tty {
-    fn open(path: &Path, baud: u32) -> Result<Self, DeviceError> {
+    pub fn open(path: &Path, baud: u32) -> Result<Self, DeviceError> {
         let device = path.display().to_string();
         match std::fs::metadata(path) {
             Ok(metadata) if metadata.file_type().is_char_device() => {}
@@ -228,7 +228,7 @@ impl Tty {
         Ok(tty)
     }
 
-    fn fd(&self) -> BorrowedFd<'_> {
+    pub fn fd(&self) -> BorrowedFd<'_> {
         // SAFETY: the port owns the descriptor, is not closed while it is borrowed, and does not lend it otherwise.
         unsafe { BorrowedFd::borrow_raw(self.port.as_raw_fd()) }
     }

@@ -214,7 +214,7 @@ fn hex_digit(digit: u8) -> Option<u8> {
 }
 
 /// The sum of a sentence: XOR of what stands between `$` and `*`.
-pub(super) fn xor(content: &[u8]) -> u8 {
+pub(crate) fn xor(content: &[u8]) -> u8 {
     content.iter().fold(0, |sum, byte| sum ^ byte)
 }
 

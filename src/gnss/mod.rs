@@ -30,3 +30,5 @@ mod xbus;
 
 pub use decoder::{DecoderCounters, DecoderSettings, GnssDecoder};
 pub use framing::Protocol;
+pub(crate) use framing::xor;
+pub(crate) use time::{NS_PER_DAY, date_of_day};

@@ -5,7 +5,7 @@ use crate::types::{NS_PER_S, SampleTime, TimeScale};
 /// Since midnight \[ns]. Up to a second more than a day in a leap second.
 pub(super) type TimeOfDayNs = i64;
 
-pub(super) const NS_PER_DAY: i64 = 86_400 * NS_PER_S as i64;
+pub(crate) const NS_PER_DAY: i64 = 86_400 * NS_PER_S as i64;
 
 /// After a silence of this many days nothing is concluded from the last time of day.
 const MAX_SILENCE_DAYS: i64 = 3650;
@@ -73,7 +73,7 @@ pub(super) fn days_since_1970(year: i64, month: i64, day: i64) -> Option<i64> {
 }
 
 /// Year, month, day of a day since 1970: the inverse of [`days_since_1970`], from the same source.
-pub(super) fn date_of_day(days: i64) -> (i64, i64, i64) {
+pub(crate) fn date_of_day(days: i64) -> (i64, i64, i64) {
     let shifted = days + 719_468;
     let era = shifted.div_euclid(146_097);
     let day_of_era = shifted.rem_euclid(146_097);

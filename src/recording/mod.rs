@@ -7,6 +7,7 @@
 mod atomic;
 mod dataset;
 mod error;
+mod estimate;
 mod events;
 mod export;
 mod health;

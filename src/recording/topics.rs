@@ -12,6 +12,9 @@
 //! | `/clock` | omniloc.ClockOffset | monotonic clock, realtime and UTC of the receiver side by side |
 //! | `/status` | omniloc.Status | rates, lag, disk, temperature: once a second |
 //! | `/dropped` | omniloc.Dropped | every loss: what, how much, why |
+//! | `/pose/estimate` | omniloc.PositionEstimate | where the localizer takes the vehicle to be |
+//!
+//! Where frames are localized, `/survey/pose` shows the estimates that may be relied on.
 
 /// A topic and the schema of its messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,9 +45,11 @@ pub static SURVEY_POSE: Topic = topic!("/survey/pose", "foxglove.PoseInFrame");
 pub static CLOCK: Topic = topic!("/clock", "omniloc.ClockOffset");
 pub static STATUS: Topic = topic!("/status", "omniloc.Status");
 pub static DROPPED: Topic = topic!("/dropped", "omniloc.Dropped");
+pub static POSE_ESTIMATE: Topic = topic!("/pose/estimate", "omniloc.PositionEstimate");
 
-/// All topics, in the order a recorder declares them in.
-pub static ALL: [&Topic; 10] = [
+/// All topics, in the order a recorder declares them in. A new one comes last: [`recover`](super::recover()) takes channel
+/// numbers of older recordings for places in this list.
+pub static ALL: [&Topic; 11] = [
     &CAMERA_IMAGE,
     &GNSS_RAW,
     &GNSS_FIX,
@@ -55,7 +60,11 @@ pub static ALL: [&Topic; 10] = [
     &CLOCK,
     &STATUS,
     &DROPPED,
+    &POSE_ESTIMATE,
 ];
+
+/// Topics whose messages carry the number of the frame that they belong to.
+pub static OF_FRAMES: [&Topic; 3] = [&SURVEY_PAIR, &SURVEY_POSE, &POSE_ESTIMATE];
 
 /// The ENU frame of all positions.
 pub const MAP_FRAME: &str = "map";

@@ -227,6 +227,10 @@ impl Check {
             "omniloc.SerialChunk" => drop(omniloc::SerialChunk::decode(data).map_err(wrong)?),
             "omniloc.ClockOffset" => drop(omniloc::ClockOffset::decode(data).map_err(wrong)?),
             "omniloc.Pulse" => drop(omniloc::Pulse::decode(data).map_err(wrong)?),
+            "omniloc.PositionEstimate" => {
+                let estimate = omniloc::PositionEstimate::decode(data).map_err(wrong)?;
+                check_estimate(&estimate)?;
+            }
             "omniloc.Status" => drop(omniloc::Status::decode(data).map_err(wrong)?),
             "omniloc.Dropped" => {
                 let dropped = omniloc::Dropped::decode(data).map_err(wrong)?;
@@ -382,6 +386,21 @@ impl Check {
     }
 }
 
+/// A position is there exactly when the vehicle is localized.
+fn check_estimate(estimate: &omniloc::PositionEstimate) -> Result<(), String> {
+    let is_localized = estimate.state() == omniloc::position_estimate::State::Localized;
+    let position_m = [estimate.east_m, estimate.north_m];
+    let is_sound = if is_localized {
+        position_m.iter().all(|coordinate| coordinate.is_some_and(f64::is_finite))
+    } else {
+        position_m == [None; 2]
+    };
+    let frame = estimate.frame_sequence;
+    let state = estimate.state().as_str_name();
+    let what = || format!("estimate of frame {frame} is {state}, but its position is {position_m:?}");
+    is_sound.then_some(()).ok_or_else(what)
+}
+
 #[cfg(test)]
 mod tests {
     use std::{fs, io::Cursor};
@@ -404,7 +423,12 @@ mod tests {
     #[test]
     fn each_inconsistency_is_reported() {
         type Fill = fn(&mut RecordingWriter<Cursor<Vec<u8>>>) -> mcap::McapResult<()>;
-        let table: [(&str, Fill, &str); 6] = [
+        let lost_with_a_place = |rec: &mut RecordingWriter<Cursor<Vec<u8>>>| {
+            let lost = omniloc::position_estimate::State::Lost.into();
+            let estimate = omniloc::PositionEstimate { state: lost, east_m: Some(1.0), ..Default::default() };
+            rec.write(&topics::POSE_ESTIMATE, 1, 0, &estimate)
+        };
+        let table: [(&str, Fill, &str); 7] = [
             ("no image", |rec| rec.write_pair(1, 0, pair(0.0)), "1 pairs belong to images that are not"),
             ("two pairs", |rec| rec.write_pair(1, 0, pair(0.0)).and(rec.write_pair(1, 0, pair(0.0))), "two pairs"),
             ("NaN", |rec| rec.write_pair(1, 0, pair(f64::NAN)), "not a number"),
@@ -419,6 +443,7 @@ mod tests {
                 |rec| rec.write_image(2, 5, &picture(16)).and(rec.write_image(1, 4, &picture(16))),
                 "before image 2",
             ),
+            ("estimate", lost_with_a_place, "estimate of frame 0 is LOST, but its position is [Some(1.0), None]"),
         ];
         let folder = tempfile::tempdir().expect("a temporary folder");
         for (name, fill, expected) in table {

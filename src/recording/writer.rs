@@ -12,6 +12,7 @@ use super::{
     proto::{foxglove, omniloc},
     topics::{self, Topic},
 };
+use crate::types::PositionM;
 
 /// Writes messages to MCAP: chunked, with CRCs and indexes. The bytes depend on what is written and on nothing else.
 ///
@@ -172,25 +173,34 @@ fn encode_image(encoded: &mut Vec<u8>, timestamp: prost_types::Timestamp, jpeg: 
     }
 }
 
-/// A pair as it is recorded, and, if it is valid, as pose for viewers.
-///
-/// A pose message cannot leave its orientation out: without a yaw it says yaw 0. The pair is what counts.
+/// A pair as it is recorded, and, if it is valid, as pose for viewers. The pair is what counts.
 pub(super) fn survey_messages(
     timestamp: prost_types::Timestamp,
     sequence: u32,
     pair: omniloc::SurveyPair,
 ) -> (omniloc::SurveyPair, Option<foxglove::PoseInFrame>) {
     let pair = omniloc::SurveyPair { timestamp: Some(timestamp), frame_sequence: sequence.into(), ..pair };
-    let half_yaw_rad = pair.yaw_rad.unwrap_or(0.0) / 2.0;
-    let pose = pair.valid.then(|| foxglove::PoseInFrame {
+    let pose = pair.valid.then(|| pose_message(timestamp, [pair.east_m, pair.north_m], pair.yaw_rad));
+    (pair, pose)
+}
+
+/// A pose in the map frame, for viewers.
+///
+/// The message cannot leave its orientation out: without a yaw it says yaw 0.
+pub(super) fn pose_message(
+    timestamp: prost_types::Timestamp,
+    [east_m, north_m]: PositionM,
+    yaw_rad: Option<f64>,
+) -> foxglove::PoseInFrame {
+    let half_yaw_rad = yaw_rad.unwrap_or(0.0) / 2.0;
+    foxglove::PoseInFrame {
         timestamp: Some(timestamp),
         frame_id: topics::MAP_FRAME.into(),
         pose: Some(foxglove::Pose {
-            position: Some(foxglove::Vector3 { x: pair.east_m, y: pair.north_m, z: 0.0 }),
+            position: Some(foxglove::Vector3 { x: east_m, y: north_m, z: 0.0 }),
             orientation: Some(foxglove::Quaternion { x: 0.0, y: 0.0, z: half_yaw_rad.sin(), w: half_yaw_rad.cos() }),
         }),
-    });
-    (pair, pose)
+    }
 }
 
 /// Protobuf's timestamp of a time \[ns\].

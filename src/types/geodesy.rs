@@ -1,5 +1,9 @@
 //! Positions on the Earth: WGS84 and the local ENU frame, by way of ECEF (earth-centred, earth-fixed).
+//!
+//! Sines and arcs come from crate `libm`: those of the system's library differ in the last digit from computer to
+//! computer, and replays give the same bytes on all.
 
+use libm::{atan2, sin, sincos};
 use serde::{Deserialize, Serialize};
 
 use super::PositionM;
@@ -27,8 +31,8 @@ impl Geodetic {
 
     /// ECEF x, y, z \[m\].
     fn to_ecef_m(self) -> [f64; 3] {
-        let (sin_lat, cos_lat) = self.latitude_deg.to_radians().sin_cos();
-        let (sin_lon, cos_lon) = self.longitude_deg.to_radians().sin_cos();
+        let (sin_lat, cos_lat) = sincos(self.latitude_deg.to_radians());
+        let (sin_lon, cos_lon) = sincos(self.longitude_deg.to_radians());
         let prime_vertical_m = SEMI_MAJOR_AXIS_M / (1.0 - ECCENTRICITY_SQUARED * sin_lat * sin_lat).sqrt();
         let axis_distance_m = (prime_vertical_m + self.altitude_m) * cos_lat;
         let z_m = (prime_vertical_m * (1.0 - ECCENTRICITY_SQUARED) + self.altitude_m) * sin_lat;
@@ -38,18 +42,18 @@ impl Geodetic {
     /// Fixed point of tan φ = (z + e² N sin φ) / p; each round shrinks the error by about e² = 0.0067 near the ground.
     fn from_ecef_m([x, y, z]: [f64; 3]) -> Self {
         const ROUNDS: usize = 8;
-        let p = x.hypot(y);
-        let mut latitude = z.atan2(p * (1.0 - ECCENTRICITY_SQUARED));
+        let p = (x * x + y * y).sqrt();
+        let mut latitude = atan2(z, p * (1.0 - ECCENTRICITY_SQUARED));
         for _ in 0..ROUNDS {
-            let sin_lat = latitude.sin();
+            let sin_lat = sin(latitude);
             let n = SEMI_MAJOR_AXIS_M / (1.0 - ECCENTRICITY_SQUARED * sin_lat * sin_lat).sqrt();
-            latitude = (z + ECCENTRICITY_SQUARED * n * sin_lat).atan2(p);
+            latitude = atan2(z + ECCENTRICITY_SQUARED * n * sin_lat, p);
         }
-        let (sin_lat, cos_lat) = latitude.sin_cos();
+        let (sin_lat, cos_lat) = sincos(latitude);
         // p cos φ + z sin φ = N (1 − e² sin² φ) + h, which is sound at the poles as well.
         let w = (1.0 - ECCENTRICITY_SQUARED * sin_lat * sin_lat).sqrt();
         let altitude_m = p * cos_lat + z * sin_lat - SEMI_MAJOR_AXIS_M * w;
-        Self { latitude_deg: latitude.to_degrees(), longitude_deg: y.atan2(x).to_degrees(), altitude_m }
+        Self { latitude_deg: latitude.to_degrees(), longitude_deg: atan2(y, x).to_degrees(), altitude_m }
     }
 }
 
@@ -63,8 +67,8 @@ pub struct LocalFrame {
 
 impl LocalFrame {
     pub fn new(origin: Geodetic) -> Self {
-        let (sin_lat, cos_lat) = origin.latitude_deg.to_radians().sin_cos();
-        let (sin_lon, cos_lon) = origin.longitude_deg.to_radians().sin_cos();
+        let (sin_lat, cos_lat) = sincos(origin.latitude_deg.to_radians());
+        let (sin_lon, cos_lon) = sincos(origin.longitude_deg.to_radians());
         let east = [-sin_lon, cos_lon, 0.0];
         let north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat];
         let up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat];

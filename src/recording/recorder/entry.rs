@@ -6,11 +6,12 @@ use prost::Message;
 
 use crate::{
     recording::{
+        estimate::estimate_messages,
         proto::omniloc,
         topics::{self, Topic},
         writer::{survey_messages, timestamp},
     },
-    types::{BufferPool, PooledBytes},
+    types::{BufferPool, PooledBytes, PositionEstimate},
 };
 
 /// One thing to be recorded.
@@ -84,13 +85,11 @@ impl Entry {
         }
     }
 
-    /// The frame that a pair belongs to.
+    /// The frame that a pair, a pose or an estimate belongs to.
     pub(super) fn pair_of_frame(&self) -> Option<u32> {
         match self {
-            Self::Message { topic, sequence, .. }
-                if topic.name == topics::SURVEY_PAIR.name || topic.name == topics::SURVEY_POSE.name =>
-            {
-                Some(*sequence)
+            Self::Message { topic, sequence, .. } => {
+                topics::OF_FRAMES.iter().any(|of_frame| of_frame.name == topic.name).then_some(*sequence)
             }
             _ => None,
         }
@@ -139,5 +138,13 @@ impl Encoder {
         let (pair, pose) = survey_messages(self.timestamp(stamp_ns), sequence, pair);
         let pose = pose.map(|pose| self.message(&topics::SURVEY_POSE, sequence, stamp_ns, &pose));
         (self.message(&topics::SURVEY_PAIR, sequence, stamp_ns, &pair), pose)
+    }
+
+    /// Where the localizer takes the vehicle to be and, if that may be relied on, the pose for viewers.
+    pub fn estimate(&self, estimate: &PositionEstimate) -> (Entry, Option<Entry>) {
+        let PositionEstimate { sequence, stamp_ns, .. } = *estimate;
+        let (message, pose) = estimate_messages(self.timestamp(stamp_ns), estimate);
+        let pose = pose.map(|pose| self.message(&topics::SURVEY_POSE, sequence, stamp_ns, &pose));
+        (self.message(&topics::POSE_ESTIMATE, sequence, stamp_ns, &message), pose)
     }
 }

@@ -22,7 +22,7 @@ use super::{
 };
 use crate::{
     recording::{RecordingError, proto::omniloc, topics::Topic},
-    types::{Clock, NS_PER_S, PooledBytes},
+    types::{Clock, NS_PER_S, PooledBytes, PositionEstimate},
 };
 
 /// The writer looks at the clock at least this often.
@@ -173,6 +173,13 @@ impl RecorderHandle {
     pub fn push_pair(&self, sequence: u32, stamp_ns: u64, pair: omniloc::SurveyPair) -> bool {
         let (pair, pose) = self.encoder.pair(sequence, stamp_ns, pair);
         let pushed = self.push(pair);
+        pose.is_none_or(|pose| self.push(pose)) && pushed
+    }
+
+    /// Where the localizer takes the vehicle to be.
+    pub fn push_estimate(&self, estimate: &PositionEstimate) -> bool {
+        let (estimate, pose) = self.encoder.estimate(estimate);
+        let pushed = self.push(estimate);
         pose.is_none_or(|pose| self.push(pose)) && pushed
     }
 

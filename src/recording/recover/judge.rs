@@ -74,6 +74,7 @@ fn decode(schema_name: &str, data: &[u8]) -> Option<Result<Decoded, prost::Decod
         "omniloc.ClockOffset" => stamped!(omniloc::ClockOffset),
         "omniloc.Status" => stamped!(omniloc::Status),
         "omniloc.Dropped" => stamped!(omniloc::Dropped),
+        "omniloc.PositionEstimate" => stamped!(omniloc::PositionEstimate),
         _ => return None,
     })
 }
