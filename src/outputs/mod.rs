@@ -173,7 +173,7 @@ impl Outputs {
         self.outputs.iter().map(Output::report).collect()
     }
 
-    /// Sends what still waits, then ends. An output that is stuck is left behind after [`FINISH_LIMIT`].
+    /// Sends what still waits, then ends. An output that is stuck is left behind after a second.
     pub fn finish(self) -> Vec<OutputReport> {
         let before = self.reports();
         self.close();

@@ -30,14 +30,17 @@ fn decoded(text: &str) -> Vec<GnssSample> {
 fn a_localized_estimate_is_a_dead_reckoning_fix_without_satellites() {
     let timed = TimedEstimate { utc_ns: Some(UTC_NS), ..localized([100.0, 200.0]) };
     // The variances along the ellipse's axes are 0.305 m² ± 0.068 m²; the sums were made by another program.
+    let text = sentences(ORIGIN, &timed, &Sentence::ALL);
     assert_eq!(
-        sentences(ORIGIN, &timed, &Sentence::ALL),
+        text,
         "$INGST,120000.200,,0.611,0.487,108.0,0.500,0.600,*71\r\n\
          $INGGA,120000.200,4049.308058,N,07353.928878,W,6,00,,30.0,M,0.0,M,,*7C\r\n\
          $PGRME,0.65,M,,M,,M*1D\r\n\
          $INRMC,120000.200,A,4049.308058,N,07353.928878,W,9.72,36.9,221126,,,E*64\r\n\
          $INHDT,61.35,T*24\r\n"
     );
+    let documented = include_str!("../../docs/outputs.md");
+    assert!(documented.contains(&text.replace("\r\n", "\n")), "as documented");
 }
 
 #[test]

@@ -237,6 +237,21 @@ mod tests {
     }
 
     #[test]
+    fn the_documented_example_is_sound() {
+        #[derive(Deserialize)]
+        struct File {
+            outputs: Settings,
+        }
+        let document = include_str!("../../docs/outputs.md");
+        let example = document.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("is there");
+        let File { outputs } = toml::from_str(example).expect("loads");
+        assert_eq!(outputs.check(), Ok(()));
+        assert!(outputs.stdout.is_some());
+        let counts = [outputs.nmea_tcp.len(), outputs.nmea_udp.len(), outputs.nmea_serial.len()];
+        assert_eq!(counts, [1; 3]);
+    }
+
+    #[test]
     fn what_cannot_be_is_refused_with_what_is_expected() {
         for (text, expected) in [
             ("[stdout]\nmax_rate_hz = 0.0", "stdout.max_rate_hz is 0, expected 0.01 to 1000"),

@@ -65,8 +65,44 @@ impl<W: Write> Link for JsonLines<W> {
 
 #[cfg(test)]
 mod tests {
+    use std::{
+        io::{BufRead, BufReader},
+        thread,
+    };
+
     use super::*;
-    use crate::outputs::test_estimates::unknown;
+    use crate::outputs::{inbox::Inbox, rate::RateLimit, test_estimates::unknown, worker};
+
+    fn numbered(sequence: u32) -> TimedEstimate {
+        let mut timed = unknown();
+        timed.estimate.sequence = sequence;
+        timed
+    }
+
+    /// The frame's number of a whole line.
+    fn number(line: &str) -> u32 {
+        let object: serde_json::Value = serde_json::from_str(line).expect("a whole line");
+        object["sequence"].as_u64().and_then(|number| number.try_into().ok()).expect("a number")
+    }
+
+    #[test]
+    fn a_reader_that_hangs_holds_up_nobody_and_then_gets_whole_lines() {
+        const FRAMES: u32 = 10_000;
+        let (reader, writer) = io::pipe().expect("a pipe");
+        let (inbox, counters) = (Inbox::new(RateLimit::new(None)), Counters::default());
+        let mut link = Some(JsonLines::new(writer, None));
+        thread::scope(|scope| {
+            let open = || link.take().ok_or_else(|| LinkError::Failed("twice".into()));
+            scope.spawn(|| worker::run("test".into(), open, &inbox, &counters));
+            (0..FRAMES).for_each(|sequence| inbox.push(&numbered(sequence)));
+            inbox.close();
+            let numbers: Vec<u32> = BufReader::new(reader).lines().map(|line| number(&line.expect("read"))).collect();
+            assert!(numbers.is_sorted() && numbers.last() == Some(&(FRAMES - 1)), "{:?}", numbers.last());
+            // A pipe holds 64 KiB.
+            assert!(inbox.dropped() > u64::from(FRAMES / 2), "{}", inbox.dropped());
+            assert_eq!(numbers.len() as u64 + inbox.dropped(), u64::from(FRAMES));
+        });
+    }
 
     #[test]
     fn a_reader_that_has_gone_ends_it() {
@@ -87,9 +123,7 @@ mod tests {
         let mut lines = JsonLines::new(writer, None);
         let counters = Counters::default();
         for sequence in 0..10_000 {
-            let mut timed = unknown();
-            timed.estimate.sequence = sequence;
-            lines.deliver(&timed, &counters).expect("takes or not");
+            lines.deliver(&numbered(sequence), &counters).expect("takes or not");
         }
         let mut text = Vec::new();
         let mut buffer = [0; 4096];
@@ -97,14 +131,9 @@ mod tests {
             text.extend(&buffer[..count]);
             lines.look_after(&counters).expect("takes");
         }
-        let numbers: Vec<u64> = text
-            .split_inclusive(|&byte| byte == b'\n')
-            .map(|line| {
-                let object: serde_json::Value = serde_json::from_slice(line).expect("a whole line");
-                object["sequence"].as_u64().expect("a number")
-            })
-            .collect();
-        assert!(numbers.is_sorted() && numbers.len() < 10_000);
+        let text = String::from_utf8(text).expect("ASCII");
+        let numbers: Vec<u32> = text.lines().map(number).collect();
+        assert!(numbers.is_sorted() && numbers.len() < 10_000 && text.ends_with('\n'));
         assert_eq!(numbers.last(), Some(&9_999), "the newest is there");
     }
 }

@@ -18,7 +18,7 @@ pub(super) fn push_decimal(out: &mut Vec<u8>, value: f64, decimals: u32) -> bool
 pub(super) fn rounded_units(value: f64, decimals: u32) -> Option<i64> {
     // Up to here an f64 holds every whole number.
     const LIMIT: f64 = 1e15;
-    let units = (value * 10_f64.powi(decimals as i32)).round();
+    let units = (value * 10_u64.pow(decimals) as f64).round();
     (units.abs() < LIMIT).then_some(units as i64)
 }
 

@@ -47,7 +47,7 @@ pub static STATUS: Topic = topic!("/status", "omniloc.Status");
 pub static DROPPED: Topic = topic!("/dropped", "omniloc.Dropped");
 pub static POSE_ESTIMATE: Topic = topic!("/pose/estimate", "omniloc.PositionEstimate");
 
-/// All topics, in the order a recorder declares them in. A new one comes last: [`recover`](super::recover()) takes channel
+/// All topics, in the order a recorder declares them in. A new one comes last: [`recover`](super::recover) takes channel
 /// numbers of older recordings for places in this list.
 pub static ALL: [&Topic; 11] = [
     &CAMERA_IMAGE,
