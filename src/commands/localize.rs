@@ -43,13 +43,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     journal::start();
     let outcome = live::localize(&config, |status| journal::show_status(&line(status)));
     journal::finish();
-    let report = outcome?;
-    eprint!("{}", summary(&report));
-    if args.timings {
+    finish(&outcome?, args.timings)
+}
+
+/// Says what became of the drive, on stderr: stdout may be full of estimates. [`DATA_LOST`] if no frame came.
+pub fn finish(report: &LocalizeReport, with_timings: bool) -> anyhow::Result<ExitCode> {
+    eprint!("{}", summary(report));
+    if with_timings {
         eprint!("{}", timings(&report.status));
     }
     let nothing_came = report.status.counts.frames == 0;
-    Ok(if nothing_came { DATA_LOST } else { DONE }.into())
+    let is_recorded = report.recorder.as_ref().is_none_or(|recorder| recorder.is_complete && recorder.health.lost == 0);
+    Ok(if nothing_came || !is_recorded { DATA_LOST } else { DONE }.into())
 }
 
 /// The state on one line.

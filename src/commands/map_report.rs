@@ -47,6 +47,16 @@ pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {
         "temperature",
         format!("{:.1}: divides log-likelihoods before they are probabilities", info.temperature),
     ));
+    if let Some(least) = info.least_resemblance {
+        lines.push(("elsewhere", format!("frames of other places stay below a resemblance of {least:.1}")));
+    }
+    lines.push((
+        "headings",
+        match info.heading_std_rad {
+            Some(std_rad) => format!("from {} panoramas, to {:.1} deg", map.positions_m.len(), std_rad.to_degrees()),
+            None => "none: not every frame has a yaw".into(),
+        },
+    ));
     let donut = &info.calibration;
     lines.push((
         "lens",

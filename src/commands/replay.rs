@@ -1,34 +1,43 @@
 //! `omniloc replay`: a recorded drive through the same tasks again.
 
-use std::{fs::File, io::BufWriter, path::PathBuf, process::ExitCode};
+use std::{
+    fs::File,
+    io::{BufWriter, Write},
+    path::{Path, PathBuf},
+    process::ExitCode,
+};
 
 use anyhow::Context;
 
 use super::{
-    BadArgument, DONE, journal,
+    BadArgument, DONE, chain, journal, localize,
     options::{OutputKind, check_input, check_no_folder, check_not_input, check_output},
     print, record,
 };
 use crate::{
-    config::RecordConfig,
+    config::{LocalizeConfig, RecordConfig},
+    outputs::{TimedEstimate, json_lines},
     recording::{
         DeviceRecords, Recording, RecordingError,
-        recorder::{Entry, Segment},
+        recorder::{self, Encoder, Entry, Segment},
         topics, write_file_atomically,
     },
     runtime::{
         drive::{self, replay_head},
+        localize::{LocalizeReport, LocalizeStatus, Session, live, playback as playback_localize},
         playback,
         survey::{Sink, Survey},
     },
     sync::CameraTurns,
+    types::{LocalFrame, PositionEstimate},
 };
 
-/// Feed a recording to the tasks that made it, as if the devices said everything again
+/// Feed a recording to the tasks of a drive, as if the devices said everything again
 ///
-/// Positions and pairs are made anew from the bytes of the receiver, with the settings of now: a better decoder, another
-/// latency. `--speed max` needs no clock and gives the same bytes every time; a number plays through the real drivers,
-/// the receiver's bytes through a pseudo-terminal.
+/// With `--mode record` positions and pairs are made anew from the bytes of the receiver, with the settings of now: a
+/// better decoder, another latency. With `--mode localize` the frames are localized on a map; estimates go to stdout as
+/// JSON lines, and with `--out` into a recording. `--speed max` needs no clock and gives the same bytes every time; a
+/// number plays through the real drivers, the receiver's bytes through a pseudo-terminal.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     #[arg(value_name = "REC.mcap")]
@@ -36,15 +45,22 @@ pub struct Args {
     /// What the tasks are to do
     #[arg(long, value_enum)]
     pub mode: Mode,
+    /// The map to localize on
+    #[arg(long, value_name = "AREA.map", required_if_eq("mode", "localize"))]
+    pub map: Option<PathBuf>,
     /// The recording that is made: a file, or with `--speed N` a folder of segments
-    #[arg(long, value_name = "OUT")]
-    pub out: PathBuf,
+    #[arg(long, value_name = "OUT", required_if_eq("mode", "record"))]
+    pub out: Option<PathBuf>,
     /// Times as fast as it was recorded, or `max`
     #[arg(long, default_value = "max", value_parser = parse_speed)]
     pub speed: Speed,
-    /// Settings for `[gnss]` and `[sync]`; everything else in the file is left aside
+    /// Settings: of a file for `record`, `[gnss]` and `[sync]`; of one for `localize`, `[motion]` and `[outputs]`; everything
+    /// else in it is left aside
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
+    /// At the end, print how long every step of a frame took
+    #[arg(long)]
+    pub timings: bool,
     /// Replace the output if it exists
     #[arg(long)]
     pub force: bool,
@@ -54,6 +70,8 @@ pub struct Args {
 pub enum Mode {
     /// Make the recording anew
     Record,
+    /// Say where the vehicle was
+    Localize,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -73,19 +91,32 @@ fn parse_speed(text: &str) -> Result<Speed, String> {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_input(&args.recording)?;
     check_no_folder(&args.recording)?;
-    check_not_input(&args.out, std::slice::from_ref(&args.recording))?;
-    match args.speed {
-        Speed::Max => check_output(&args.out, OutputKind::File, args.force)?,
-        // Segments of two drives in one folder are mixed up for good.
-        Speed::Times(_) => check_output(&args.out, OutputKind::Folder, false)?,
+    if let Some(out) = &args.out {
+        check_not_input(out, [&args.recording].into_iter().chain(&args.map))?;
+        match args.speed {
+            Speed::Max => check_output(out, OutputKind::File, args.force)?,
+            // Segments of two drives in one folder are mixed up for good.
+            Speed::Times(_) => check_output(out, OutputKind::Folder, false)?,
+        }
     }
+    match args.mode {
+        Mode::Record => record_again(args),
+        Mode::Localize => localize(args),
+    }
+}
+
+fn record_again(args: &Args) -> anyhow::Result<ExitCode> {
+    if args.map.is_some() || args.timings {
+        return Err(BadArgument("--map and --timings go with --mode localize".into()).into());
+    }
+    let out = args.out.as_deref().context("--out is required")?;
     let given = args.config.as_deref().map(RecordConfig::load).transpose();
-    let given = given.map_err(|error| BadArgument(error.to_string()))?;
+    let given = given.map_err(|error| BadArgument(chain(&error)))?;
     journal::start();
     let recording = Recording::open_any(&args.recording)?;
-    let config = RecordConfig::for_replay(&args.recording, &recording.name, &args.out, given.as_ref());
+    let config = RecordConfig::for_replay(&args.recording, &recording.name, out, given.as_ref());
     match args.speed {
-        Speed::Max => as_fast_as_it_goes(args, &recording, &config),
+        Speed::Max => as_fast_as_it_goes(args, out, &recording, &config),
         Speed::Times(times) => {
             let config = RecordConfig { replay_speed: times, ..config };
             let outcome = drive::record(&config, |status| journal::show_status(&record::line(status)));
@@ -93,6 +124,86 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             record::finish(&outcome?)
         }
     }
+}
+
+fn localize(args: &Args) -> anyhow::Result<ExitCode> {
+    let map = args.map.as_deref().context("--map is required")?;
+    check_input(map)?;
+    let given = args.config.as_deref().map(LocalizeConfig::load).transpose();
+    let given = given.map_err(|error| BadArgument(chain(&error)))?;
+    let recording = Recording::open_any(&args.recording)?;
+    let config = LocalizeConfig::for_replay(&args.recording, &recording.name, map, given.as_ref());
+    journal::start();
+    match args.speed {
+        Speed::Max => localize_as_fast_as_it_goes(args, &recording, &config),
+        Speed::Times(times) => {
+            let recorder = args.out.as_deref().map(recorder::Settings::new);
+            let config = LocalizeConfig { replay_speed: times, recorder, ..config };
+            let outcome = live::localize(&config, |status| journal::show_status(&localize::line(status)));
+            journal::finish();
+            localize::finish(&outcome?, args.timings)
+        }
+    }
+}
+
+fn localize_as_fast_as_it_goes(
+    args: &Args,
+    recording: &Recording,
+    config: &LocalizeConfig,
+) -> anyhow::Result<ExitCode> {
+    let map = live::read_map(&config.map.file)?;
+    let map_frame = map.info.origin.map(LocalFrame::new);
+    let log_offset_ns = drive::log_offset_ns(recording);
+    let mut session = Session::new(map, config.motion).with_context(|| config.map.file.display().to_string())?;
+    let mut stdout = BufWriter::new(std::io::stdout().lock());
+    let mut line = Vec::new();
+    let mut each = |estimate: &PositionEstimate| {
+        let utc_ns = i64::try_from(estimate.stamp_ns + log_offset_ns).ok().filter(|_| log_offset_ns > 0);
+        line.clear();
+        json_lines::write_line(&TimedEstimate { estimate: *estimate, utc_ns }, map_frame.as_ref(), &mut line);
+        stdout.write_all(&line)
+    };
+    let play = |session: &mut Session, each: &mut dyn FnMut(&PositionEstimate) -> std::io::Result<()>| {
+        let records = DeviceRecords::open(&args.recording)?;
+        playback_localize::play(records, session, each)
+            .with_context(|| format!("replaying {}", args.recording.display()))
+    };
+    match &args.out {
+        None => play(&mut session, &mut each)?,
+        Some(out) => {
+            let head = drive::localize_head(recording, config);
+            let first_ns = drive::first_clocks(&args.recording)?.monotonic_ns;
+            let encoder = Encoder::new(log_offset_ns);
+            write_file_atomically(out, |file| {
+                let failed = |error| RecordingError::cannot_write(out, error);
+                let segment = Segment::start(file, &head, first_ns).map_err(failed)?;
+                let mut to_file = ToFile { segment, entries: 0, error: None };
+                play(&mut session, &mut |estimate| {
+                    let (message, pose) = encoder.estimate(estimate);
+                    to_file.push(message);
+                    pose.into_iter().for_each(|pose| _ = to_file.push(pose));
+                    each(estimate)
+                })?;
+                if let Some(error) = to_file.error {
+                    return Err(failed(error).into());
+                }
+                to_file.segment.finish().map_err(failed)?;
+                Ok::<(), anyhow::Error>(())
+            })?;
+        }
+    }
+    // Whoever reads may have seen enough.
+    match stdout.flush() {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => return Err(error.into()),
+        _ => {}
+    }
+    let status = LocalizeStatus {
+        counts: session.counts(),
+        last: session.last().copied(),
+        timings: *session.timings(),
+        ..LocalizeStatus::default()
+    };
+    localize::finish(&LocalizeReport { status, outputs: Vec::new(), recorder: None }, args.timings)
 }
 
 /// Entries become one file at once.
@@ -115,15 +226,20 @@ impl Sink for ToFile<'_> {
     fn mark(&mut self) {}
 }
 
-fn as_fast_as_it_goes(args: &Args, recording: &Recording, config: &RecordConfig) -> anyhow::Result<ExitCode> {
+fn as_fast_as_it_goes(
+    args: &Args,
+    out_path: &Path,
+    recording: &Recording,
+    config: &RecordConfig,
+) -> anyhow::Result<ExitCode> {
     let head = replay_head(recording, config)?;
     let log_offset_ns = head.log_offset_ns;
     let clocks_recorded = recording.topics.contains_key(topics::CLOCK.name);
     let turns = recording.calibration().ok().map(CameraTurns::new);
     let mut survey = Survey::new(&config.decoder, &config.sync, log_offset_ns).map_err(anyhow::Error::msg)?;
     let mut entries = 0;
-    write_file_atomically(&args.out, |file| {
-        let failed = |error| RecordingError::cannot_write(&args.out, error);
+    write_file_atomically(out_path, |file| {
+        let failed = |error| RecordingError::cannot_write(out_path, error);
         let first_ns = drive::first_clocks(&args.recording)?.monotonic_ns;
         let segment = Segment::start(file, &head, first_ns).map_err(failed)?;
         let mut out = ToFile { segment, entries: 0, error: None };
@@ -143,7 +259,7 @@ fn as_fast_as_it_goes(args: &Args, recording: &Recording, config: &RecordConfig)
         status.frames,
         status.pairs + status.pairs_invalid,
         status.pairs_invalid,
-        args.out.display()
+        out_path.display()
     ))?;
     Ok(DONE.into())
 }

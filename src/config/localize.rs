@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Camera, ConfigError, Fault, Vehicle, load, read_camera, tables::Tables};
-use crate::{devices::simulated, localize::MotionSettings, outputs};
+use super::{Camera, ConfigError, Fault, Replay, Vehicle, load, read_camera, tables::Tables};
+use crate::{devices::simulated, localize::MotionSettings, outputs, recording::recorder};
 
 /// Everything `omniloc localize` needs to know.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -15,6 +15,9 @@ pub struct LocalizeConfig {
     pub map: Map,
     pub motion: MotionSettings,
     pub outputs: outputs::Settings,
+    /// Estimates are recorded too.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recorder: Option<recorder::Settings>,
     /// How many times as fast as it was recorded a drive is replayed.
     #[serde(skip)]
     pub replay_speed: f64,
@@ -47,13 +50,14 @@ impl LocalizeConfig {
             map: tables.required("map")?.read(|_| Ok(()))?,
             motion: tables.or_empty("motion").read(MotionSettings::check)?,
             outputs: tables.or_empty("outputs").read(outputs::Settings::check)?,
+            recorder: tables.optional("recorder").map(|table| table.read(recorder::Settings::check)).transpose()?,
             replay_speed: 1.0,
             simulation: tables
                 .optional("simulation")
                 .map(|table| table.read(simulated::Settings::check))
                 .transpose()?,
         };
-        tables.refuse_others("[vehicle], [camera], [map], [motion], [outputs] or [simulation]")?;
+        tables.refuse_others("[vehicle], [camera], [map], [motion], [outputs], [recorder] or [simulation]")?;
         match (&config.simulation, &config.camera) {
             (_, Camera::None) => Err(Fault::new(0, "[camera]: driver is \"none\", but localizing needs a camera")),
             (None, Camera::Simulated) => Err(Fault::new(text.len(), "a simulated driver needs the table [simulation]")),
@@ -71,10 +75,81 @@ impl LocalizeConfig {
             resolve(&mut replay.recording);
         }
         resolve(&mut self.map.file);
+        self.recorder.iter_mut().for_each(|recorder| resolve(&mut recorder.folder));
+    }
+
+    /// The frames of a recording on a map; `given`: how the vehicle moves, and where estimates go, which is stdout if
+    /// nothing is given.
+    pub fn for_replay(recording: &Path, name: &str, map: &Path, given: Option<&Self>) -> Self {
+        let stdout = Some(outputs::StdoutSettings::default());
+        Self {
+            vehicle: Vehicle { name: name.into(), calibration: None },
+            camera: Camera::Replay(Replay { recording: recording.into() }),
+            map: Map { file: map.into() },
+            motion: given.map(|given| given.motion).unwrap_or_default(),
+            outputs: given.map_or(outputs::Settings { stdout, ..Default::default() }, |given| given.outputs.clone()),
+            recorder: None,
+            replay_speed: 1.0,
+            simulation: None,
+        }
     }
 
     /// The settings with all defaults filled in, as TOML that loads again.
     pub fn resolved(&self) -> String {
         toml::to_string(self).expect("settings are tables of plain values")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    fn shipped() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("config/localize.toml")
+    }
+
+    #[test]
+    fn the_shipped_file_loads_and_states_the_true_defaults() {
+        let text = fs::read_to_string(shipped()).expect("readable");
+        let config = LocalizeConfig::load(&shipped()).unwrap_or_else(|error| panic!("{error}"));
+        assert_eq!(LocalizeConfig::parse(&config.resolved()).expect("loads again"), config);
+        let is_setting = |line: &str| {
+            let key = line.split_once(" = ").map_or("", |(key, _)| key);
+            !key.is_empty() && key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit())
+        };
+        let uncommented: String = text
+            .lines()
+            .map(|line| match line.strip_prefix("# ") {
+                Some(setting) if is_setting(setting) => format!("{setting}\n"),
+                _ => format!("{line}\n"),
+            })
+            .collect();
+        assert_ne!(uncommented, text, "it explains something");
+        let mut with_defaults = LocalizeConfig::parse(&uncommented).unwrap_or_else(|fault| panic!("{fault:?}"));
+        with_defaults.resolve_paths(shipped().parent().expect("a folder"));
+        assert_eq!(with_defaults.resolved(), config.resolved());
+    }
+
+    const LEAST: &str = "[vehicle]\nname = \"car\"\n[camera]\ndriver = \"v4l2\"\ndevice = \"/dev/video0\"\n[map]\n\
+                         file = \"area.map\"\n";
+
+    #[test]
+    fn what_is_wrong_is_refused() {
+        assert!(LocalizeConfig::parse(LEAST).is_ok());
+        let table = [
+            ("[map]\nfile = \"area.map\"", "", "the table [map] is missing"),
+            ("driver = \"v4l2\"\ndevice = \"/dev/video0\"", "driver = \"none\"", "localizing needs a camera"),
+            ("[map]", "[motion]\nspeed_limit_mps = 0.0\n[map]", "[motion]: speed_limit_mps = 0: expected 0.1 to 200"),
+            ("[map]", "[motion]\nspeed_kmh = 3\n[map]", "[motion]: unknown field `speed_kmh`"),
+            ("[map]", "[gnss]\ndriver = \"none\"\n[map]", "unknown table or key `gnss`, expected [vehicle]"),
+            ("[map]", "[[outputs.nmea_tcp]]\nlisten = \"here\"\n[map]", "an IP address and a port"),
+            ("[map]", "[simulation]\nplace = \"town\"\n[map]", "no driver is `simulated`"),
+        ];
+        for (from, to, expected) in table {
+            let fault = LocalizeConfig::parse(&LEAST.replacen(from, to, 1)).expect_err(expected);
+            assert!(fault.what.contains(expected), "expected `{expected}`, found `{}`", fault.what);
+        }
     }
 }

@@ -98,7 +98,7 @@ fn rauch_tung_striebel(stamps_ns: &[u64], sightings: &[Mode], settings: &MotionS
             mean: transition * last.mean,
             covariance: transition * last.covariance * transition.transpose() + jitter,
         };
-        let innovation = observe * before.covariance * observe.transpose() + noise_of(seen);
+        let innovation: Matrix2<f64> = observe * before.covariance * observe.transpose() + noise_of(seen);
         let Some(inverse) = innovation.try_inverse() else { return states };
         let gain = before.covariance * observe.transpose() * inverse;
         let surprise = Vector2::from(seen.mean_m) - observe * before.mean;

@@ -31,7 +31,7 @@ const LEAST_SHARE: f64 = 1e-3;
 const DOUBT: f64 = 1e-4;
 /// And after a frame that contradicts those before it.
 const DOUBT_IN_CONTRADICTION: f64 = 0.5;
-/// A frame fits the place of the belief if a cell within so many deviations, and at least so many steps, is likely.
+/// A frame fits where the vehicle was expected if a cell within so many deviations, and at least so many steps, is likely.
 const FITTING_STDS: f64 = 3.0;
 const FITTING_STEPS: f64 = 3.0;
 /// Without a usable frame for so long, a position must be found anew \[s\].
@@ -108,6 +108,7 @@ impl Tracker {
     /// Takes a frame. Stamps must not fall; one that does counts as no time having passed.
     pub fn take(&mut self, frame: &Observation) -> Tracked {
         self.advance(frame.stamp_ns);
+        let expected = self.belief.mode();
         // Frames that follow each other closely err alike; they share what one frame is worth.
         let since_s = self.last_used_ns.map(|last| seconds(last, frame.stamp_ns));
         let share = since_s.map_or(1.0, |since_s| (since_s / SAME_ERROR_S).clamp(LEAST_SHARE, 1.0));
@@ -117,7 +118,7 @@ impl Tracker {
         let mode = self.belief.mode();
 
         let best = most_likely_cell(frame.log_likelihood);
-        let contradiction = self.contradiction(frame.log_likelihood, best, &mode);
+        let contradiction = self.contradiction(frame.log_likelihood, best, &expected);
         let resemblance =
             frame.nowhere.map(|nowhere| f64::from(frame.log_likelihood[best] - nowhere) / self.temperature);
         let evidence = Evidence { probability: mode.probability, contradiction, resemblance, share };
@@ -160,14 +161,18 @@ impl Tracker {
         }
     }
 
-    /// How much likelier the frame finds its best cell than any near the belief's hill, in nats.
-    fn contradiction(&self, log_likelihood: &[f32], best: usize, mode: &Mode) -> f64 {
-        let PositionCovariance { ee_m2, nn_m2, .. } = mode.covariance;
-        let reach_m = (FITTING_STDS * ee_m2.max(nn_m2).sqrt()).max(FITTING_STEPS * self.cells.grid.step_m);
-        if distance_m(self.cells.center_m(best), mode.mean_m) <= reach_m {
+    /// How much likelier the frame finds its best cell than any where the vehicle was expected to be, in nats; 0 where
+    /// nothing was expected.
+    fn contradiction(&self, log_likelihood: &[f32], best: usize, expected: &Mode) -> f64 {
+        if expected.probability < TRACKED {
             return 0.0;
         }
-        let near = |cell: &usize| distance_m(self.cells.center_m(*cell), mode.mean_m) <= reach_m;
+        let PositionCovariance { ee_m2, nn_m2, .. } = expected.covariance;
+        let reach_m = (FITTING_STDS * ee_m2.max(nn_m2).sqrt()).max(FITTING_STEPS * self.cells.grid.step_m);
+        if distance_m(self.cells.center_m(best), expected.mean_m) <= reach_m {
+            return 0.0;
+        }
+        let near = |cell: &usize| distance_m(self.cells.center_m(*cell), expected.mean_m) <= reach_m;
         let here = (0..log_likelihood.len()).filter(near).map(|cell| log_likelihood[cell]).reduce(f32::max);
         let best = log_likelihood[best];
         here.map_or(f64::INFINITY, |here| f64::from(best - here) / self.temperature)

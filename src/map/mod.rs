@@ -73,7 +73,7 @@ pub struct MapInfo {
     /// p(cell) ∝ exp(log-likelihood / temperature): learned from frames that were held back, whole recordings of them
     /// where there are several.
     pub temperature: f64,
-    /// Frames of places that are not in the map resemble their best cell less than this, but for one in twenty: how much
+    /// Frames of places that are not in the map resemble their best cell less than this, but for one in a hundred: how much
     /// likelier it is than no place, in nats at the map's temperature. `None` where the map cannot tell.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub least_resemblance: Option<f64>,

@@ -11,7 +11,7 @@ use rustix::{
 pub use super::live::DriveReport;
 use super::live::{self, DeviceRun, Devices, DriveSettings};
 use crate::{
-    config::{Camera, Gnss, RecordConfig, Replay},
+    config::{Camera, Gnss, LocalizeConfig, RecordConfig, Replay},
     devices::{
         CameraEvent, CameraFacts, GpioEvent, SerialEvent, Stop, camera_v4l2, gnss_serial,
         gpio::{self, Led, SimulatedPins},
@@ -22,7 +22,7 @@ use crate::{
     recording::{
         DeviceRecord, DeviceRecords, Recording,
         proto::omniloc,
-        recorder::{Folder, Head, Recorder},
+        recorder::{self, Folder, Head, Recorder},
         topics,
     },
     types::{Clock, ClockReading, DonutCalibration, NS_PER_S, ScaledClock, SystemClock},
@@ -68,16 +68,7 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
     let name = format!("{}, {} at {start_s} s", config.vehicle.name, boot_id.get(..8).unwrap_or_default());
     head.name_source(&name);
     let log_offset_ns = head.log_offset_ns;
-    let storage = Folder::new(&config.recorder.folder)
-        .with_context(|| format!("using the folder {}", config.recorder.folder.display()))?;
-    // A read-only file system may become writable again; a folder of somebody else does not.
-    if access(&config.recorder.folder, Access::WRITE_OK) == Err(Errno::ACCESS) {
-        anyhow::bail!(
-            "{}: this user may not write here: change its owner (chown) or `folder` in [recorder]",
-            config.recorder.folder.display()
-        );
-    }
-    let recorder = Recorder::start(config.recorder.clone(), head, &boot_id, Arc::new(storage), clock.clone())?;
+    let recorder = start_recorder(&config.recorder, head, &boot_id, &clock)?;
 
     let ports = tempfile::tempdir().context("making a folder for pseudo-terminals")?;
     let stop = Stop::default();
@@ -102,6 +93,25 @@ pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) 
         let _ = player.join();
     }
     report
+}
+
+/// A recorder that writes to the folder of its settings.
+pub fn start_recorder(
+    settings: &recorder::Settings,
+    head: Head,
+    boot_id: &str,
+    clock: &Arc<dyn Clock>,
+) -> anyhow::Result<Recorder> {
+    let folder = &settings.folder;
+    let storage = Folder::new(folder).with_context(|| format!("using the folder {}", folder.display()))?;
+    // A read-only file system may become writable again; a folder of somebody else does not.
+    if access(folder, Access::WRITE_OK) == Err(Errno::ACCESS) {
+        anyhow::bail!(
+            "{}: this user may not write here: change its owner (chown) or `folder` in [recorder]",
+            folder.display()
+        );
+    }
+    Ok(Recorder::start(settings.clone(), head, boot_id, Arc::new(storage), clock.clone())?)
 }
 
 /// The world of a simulated drive, and the truth of what happens in it.
@@ -312,6 +322,21 @@ pub fn replay_head(recording: &Recording, config: &RecordConfig) -> anyhow::Resu
     Ok(head)
 }
 
+/// The head of a recording of estimates.
+pub fn localize_head(recording: &Recording, config: &LocalizeConfig) -> Head {
+    let start = ClockReading { monotonic_ns: 0, realtime_ns: log_offset_ns(recording) as i64 };
+    // Where files lie on this computer says nothing about the drive.
+    let mut settings = config.clone();
+    settings.camera = Camera::Replay(Replay { recording: recording.path.file_name().unwrap_or_default().into() });
+    settings.map.file = config.map.file.file_name().unwrap_or_default().into();
+    let boot_id = recording.metadata.get(topics::metadata::SOURCE).and_then(|source| source.get("boot_id"));
+    let mut head = Head::new(&settings.resolved(), &recording.name, boot_id.map_or("", String::as_str), start);
+    head.calibration_json = recording.calibration_json().map(<[u8]>::to_vec);
+    head.name_source(&recording.name);
+    head.name_command("localize");
+    head
+}
+
 /// What a recording says about its camera.
 pub fn camera_facts(path: &Path) -> anyhow::Result<CameraFacts> {
     let recording = Recording::open_any(path)?;
@@ -345,12 +370,12 @@ fn read_calibration(path: &Path) -> anyhow::Result<Vec<u8>> {
     Ok(json)
 }
 
-fn calibration_json(donut: &DonutCalibration) -> Vec<u8> {
+pub fn calibration_json(donut: &DonutCalibration) -> Vec<u8> {
     serde_json::to_vec_pretty(donut).expect("a calibration is plain numbers")
 }
 
 /// Which start of the computer this is; the same for all drives until it is switched off.
-fn boot_id() -> String {
+pub fn boot_id() -> String {
     let id = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
     let id = id.trim();
     if id.is_empty() { "00000000-0000-0000-0000-000000000000".into() } else { id.into() }

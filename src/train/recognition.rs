@@ -10,7 +10,7 @@ const FAR_SPACINGS: f64 = 8.0;
 const MIN_FRAMES: usize = 8;
 const MIN_FAR_SHARE: f64 = 0.2;
 /// So many of the frames resemble a place that is not theirs less than what is learned.
-const QUANTILE: f64 = 0.95;
+const QUANTILE: f64 = 0.99;
 
 /// Frames that were held back, as the map sees them.
 pub struct HeldBack<'a> {
@@ -22,7 +22,7 @@ pub struct HeldBack<'a> {
     pub truth_m: &'a [PositionM],
 }
 
-/// The resemblance that frames of places outside the map stay below but for one in twenty: how much larger the greatest
+/// The resemblance that frames of places outside the map stay below but for one in a hundred: how much larger the greatest
 /// log-likelihood is than that of no place. `None` with too few frames, or where no place lies far from another.
 pub fn least_resemblance(held_back: &HeldBack, spacing_m: f64) -> Option<f64> {
     let HeldBack { cells, log_likelihoods, nowhere, truth_m } = held_back;
@@ -66,7 +66,7 @@ mod tests {
         let nowhere = vec![10.0; 50];
         let held_back =
             HeldBack { cells: &cells, log_likelihoods: &log_likelihoods, nowhere: &nowhere, truth_m: &truth_m };
-        assert_eq!(least_resemblance(&held_back, 1.0), Some(47.0 - 10.0));
+        assert_eq!(least_resemblance(&held_back, 1.0), Some(49.0 - 10.0));
         // A place as small as this has no elsewhere.
         assert_eq!(least_resemblance(&held_back, 30.0), None);
     }

@@ -3,6 +3,7 @@
 #![allow(dead_code, reason = "each test program uses a part")]
 
 pub mod drive;
+pub mod map;
 
 use std::{
     collections::BTreeMap,

@@ -120,6 +120,11 @@ impl Head {
         self.metadata.entry(metadata::SOURCE.into()).or_default().insert("name".into(), name.into());
     }
 
+    /// The command that writes the recording, if it is not `record`.
+    pub fn name_command(&mut self, command: &str) {
+        self.metadata.entry(metadata::PROGRAM.into()).or_default().insert("command".into(), command.into());
+    }
+
     /// Sets a metadata record.
     pub fn set(&mut self, name: &str, entries: &[(&str, &str)]) {
         let entries = entries.iter().map(|&(key, value)| (key.into(), value.into())).collect();

@@ -27,6 +27,7 @@ use crate::{
     localize::Timings,
     map::{FeatureMap, file},
     outputs::{OutputReport, Outputs},
+    recording::recorder::{Encoder, Head, Recorder, RecorderHandle, RecorderReport},
     runtime::{
         drive::{self, SIMULATED_START},
         live::DeviceRun,
@@ -38,6 +39,7 @@ use crate::{
 
 /// Part of the time to stop that the camera and the localizer have.
 const STOP_LIMIT: Duration = Duration::from_secs(3);
+const RECORDER_STOP_LIMIT: Duration = Duration::from_secs(12);
 /// Realtime before this, 2020, is that of a computer without a battery clock that has not been told the date.
 const LEAST_REALTIME_NS: i64 = 1_577_836_800_000_000_000;
 
@@ -60,6 +62,7 @@ pub struct LocalizeStatus {
 pub struct LocalizeReport {
     pub status: LocalizeStatus,
     pub outputs: Vec<OutputReport>,
+    pub recorder: Option<RecorderReport>,
 }
 
 /// What the localizer's thread tells the rest.
@@ -78,6 +81,7 @@ pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus
     let map = read_map(&config.map.file)?;
     let watched = MapWatch::new(&config.map.file);
     let outputs = Outputs::start(&config.outputs, map.info.origin)?;
+    let calibration = drive::calibration_json(&map.info.calibration);
     let session = Session::new(map, config.motion).with_context(|| config.map.file.display().to_string())?;
     let simulated = config.simulation.as_ref().map(drive::simulate);
     let simulation = simulated.as_ref().map(|(simulation, world)| (simulation.clone(), world));
@@ -91,13 +95,17 @@ pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus
     let speed = config.simulation.as_ref().map_or(1.0, |simulation| simulation.speed) * config.replay_speed;
     let clock = drive::clock(start, speed, simulation.as_ref().map(|(simulation, _)| simulation));
 
+    let recorder = start_recorder(config, calibration, &clock)?;
+    let recorded = recorder.as_ref().map(|(recorder, encoder)| (recorder.handle(), encoder.clone()));
+
     let frames = Arc::new(Newest::default());
     let shared = Arc::<Mutex<Shared>>::default();
     let health = Arc::new(Mutex::new("starting"));
     let stop = Stop::default();
     let camera = start_camera(camera, &frames, &health, &clock, &stop)?;
     let outputs = Arc::new(outputs);
-    let localizer = start_localizer(session, &frames, &shared, &outputs, &clock)?;
+    let sinks = Sinks { outputs: outputs.clone(), recorded };
+    let localizer = start_localizer(session, &frames, &shared, sinks, &clock)?;
 
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("starting the runtime")?;
     let second = Duration::from_secs_f64(1.0 / speed);
@@ -111,11 +119,12 @@ pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus
     outcome?;
     let status = watch.status(0.0);
     let error = watch.shared().error.take();
+    let recorder = recorder.map(|(recorder, _)| recorder.finish(RECORDER_STOP_LIMIT));
     // The localizer's thread has its own handle; once that has ended this is the last.
     let outputs = Arc::try_unwrap(outputs).map_or_else(|outputs| outputs.reports(), Outputs::finish);
     match error {
         Some(error) => Err(error).with_context(|| config.map.file.display().to_string()),
-        None => Ok(LocalizeReport { status, outputs }),
+        None => Ok(LocalizeReport { status, outputs, recorder }),
     }
 }
 
@@ -150,18 +159,50 @@ fn start_camera(
     supervise("camera", clock.clone(), stop.clone(), run, report).context("starting the thread camera")
 }
 
+/// Where estimates go.
+struct Sinks {
+    outputs: Arc<Outputs>,
+    recorded: Option<(RecorderHandle, Encoder)>,
+}
+
+impl Sinks {
+    fn send(&self, estimate: &PositionEstimate, utc_ns: Option<i64>) {
+        self.outputs.send(estimate, utc_ns);
+        if let Some((recorder, encoder)) = &self.recorded {
+            let (message, pose) = encoder.estimate(estimate);
+            recorder.push(message);
+            pose.into_iter().for_each(|pose| _ = recorder.push(pose));
+        }
+    }
+}
+
+fn start_recorder(
+    config: &LocalizeConfig,
+    calibration_json: Vec<u8>,
+    clock: &Arc<dyn Clock>,
+) -> anyhow::Result<Option<(Recorder, Encoder)>> {
+    let Some(settings) = &config.recorder else { return Ok(None) };
+    let boot_id = drive::boot_id();
+    let mut head = Head::new(&config.resolved(), &config.vehicle.name, &boot_id, clock.read());
+    head.calibration_json = Some(calibration_json);
+    head.name_source(&config.vehicle.name);
+    head.name_command("localize");
+    let encoder = Encoder::new(head.log_offset_ns);
+    Ok(Some((drive::start_recorder(settings, head, &boot_id, clock)?, encoder)))
+}
+
 fn start_localizer(
     mut session: Session,
     frames: &Arc<Newest>,
     shared: &Arc<Mutex<Shared>>,
-    outputs: &Arc<Outputs>,
+    sinks: Sinks,
     clock: &Arc<dyn Clock>,
 ) -> anyhow::Result<JoinHandle<()>> {
-    let (frames, shared, outputs, clock) = (frames.clone(), shared.clone(), outputs.clone(), clock.clone());
+    let (frames, shared, clock) = (frames.clone(), shared.clone(), clock.clone());
     let run = move || {
         while let Some(event) = frames.next() {
             match session.take(&event) {
-                Ok(Some(estimate)) => outputs.send(&estimate, utc_ns(&*clock, estimate.stamp_ns)),
+                Ok(Some(estimate)) => sinks.send(&estimate, utc_ns(&*clock, estimate.stamp_ns)),
                 Ok(None) => {}
                 Err(error) => {
                     lock(&shared).error = Some(error);
