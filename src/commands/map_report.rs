@@ -6,6 +6,8 @@ use serde_json::json;
 
 use super::printable;
 use crate::map::{FeatureMap, GroupHyperparameters, TrackReport};
+use crate::metrics::ErrorFigures;
+use crate::train::UpdateReport;
 
 pub fn as_json(path: &Path, map: &FeatureMap, size_bytes: u64) -> serde_json::Value {
     json!({
@@ -16,6 +18,33 @@ pub fn as_json(path: &Path, map: &FeatureMap, size_bytes: u64) -> serde_json::Va
         "cells": map.cells.len(),
         "info": map.info,
     })
+}
+
+/// What adding a drive did to a map.
+pub fn of_update(report: &UpdateReport) -> String {
+    let mut text = format!("added           {} frames\n", report.frames);
+    if let Some(track) = &report.track {
+        text += &format!("positions       {}\n", positions(track));
+    }
+    text += &format!("cells           {}, {} before\n", report.cells[1], report.cells[0]);
+    text += "held back              frames   RMSE  median     P95   >10 m\n";
+    let mut line = |of: &str, figures: &ErrorFigures| {
+        text += &format!(
+            "{of:<22} {:>6} {:>5.2}m {:>6.2}m {:>6.2}m {:>6.1}%\n",
+            figures.n,
+            figures.rmse_m,
+            figures.median_m,
+            figures.p95_m,
+            100.0 * figures.share_over_10m
+        );
+    };
+    for (of, figures) in [("of the map", report.old.as_ref()), ("of the drive", Some(&report.new))] {
+        if let Some(figures) = figures {
+            line(&format!("{of}, before"), &figures.before);
+            line(&format!("{of}, after"), &figures.after);
+        }
+    }
+    text
 }
 
 pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {

@@ -1,20 +1,23 @@
 //! `omniloc train`: recordings become a map.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use anyhow::Context;
+
+use super::evaluate::open_map;
 use super::map_report;
-use super::options::{OutputKind, check_not_input, check_output};
+use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
 use super::survey::{
     appearances, bad_argument, default_grid_step_m, in_one_place, open_recordings, parse_descriptor, parse_spacing_m,
-    read_to_learn,
+    read_to_learn, read_to_match,
 };
-use super::{DONE, print};
+use super::{BadArgument, DONE, print};
 use crate::features::Descriptor;
 use crate::map::{Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
 use crate::recording::write_bytes_atomically;
-use crate::train::{TrainSettings, train};
+use crate::train::{TrainSettings, train, update};
 
 /// Turn recordings of a place into a map
 ///
@@ -28,6 +31,17 @@ pub struct Args {
     /// The map to write
     #[arg(long, value_name = "AREA.map")]
     pub out: PathBuf,
+    /// Add one drive to this map instead of making a new one: another appearance, other streets. Its accuracy before and
+    /// after is measured on frames of both that are held back; a map that has become worse is not written
+    #[arg(
+        long,
+        value_name = "OLD.map",
+        conflicts_with_all = ["features", "select", "grid_step_m", "within_m"]
+    )]
+    pub update: Option<PathBuf>,
+    /// With --update: write the map even if it has become worse
+    #[arg(long, requires = "update")]
+    pub even_if_worse: bool,
     #[arg(long, value_enum, default_value = "default")]
     pub recipe: RecipeName,
     /// Feature types, in place of the recipe's own: fft, hist, hist-sqrt, sp, sp-log, sp-energy, gradient,
@@ -67,6 +81,9 @@ const MIN_SKILL: f64 = 0.5;
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_output(&args.out, OutputKind::File, args.force)?;
     check_not_input(&args.out, &args.recordings)?;
+    if let Some(old) = &args.update {
+        return add_drive(args, old);
+    }
     let recipe = Recipe::new(args.recipe, &args.features);
     let recipe = match args.select {
         Some(selection) => recipe.with_selection(selection),
@@ -102,5 +119,43 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         );
     }
     print(&map_report::as_text(&args.out, &map, bytes.len() as u64))?;
+    Ok(DONE.into())
+}
+
+/// A map with one more drive, if that does not make it worse.
+fn add_drive(args: &Args, old: &Path) -> anyhow::Result<ExitCode> {
+    check_input(old)?;
+    check_not_input(&args.out, [&old.to_path_buf()])?;
+    let map = open_map(old)?;
+    let mut recordings = open_recordings(&args.recordings, args.spacing_m)?;
+    let [recording] = recordings.as_mut_slice() else {
+        return Err(BadArgument("--update adds one recording at a time: each is to be judged by itself".into()).into());
+    };
+    if let Some(origin) = map.info.origin
+        && !recording.move_origin(origin)
+    {
+        let path = recording.path.display();
+        anyhow::bail!("{path}: does not know where on the Earth it lies, but {} does", old.display());
+    }
+    let progress = Progress::new();
+    let descriptors = map.info.groups.iter().map(|group| group.recipe.descriptor).collect();
+    let survey = read_to_match(recording, descriptors, &progress)?;
+    map.info
+        .check_lens(&survey.calibration, survey.image_size_px)
+        .with_context(|| format!("{} into {}", recording.path.display(), old.display()))?;
+    let smoothing = args.smooth.unwrap_or(Smoothing::usual(map.info.recipe));
+    let (updated, report) = update(&map, &survey, &recording.name, smoothing)
+        .with_context(|| format!("adding {} to {}", recording.path.display(), old.display()))?;
+    progress.finish();
+    print(&map_report::of_update(&report))?;
+    if report.is_worse() && !args.even_if_worse {
+        anyhow::bail!(
+            "{} was not written: with this drive the map is worse on frames that were held back; --even-if-worse writes it",
+            args.out.display()
+        );
+    }
+    let bytes = file::to_bytes(&updated);
+    write_bytes_atomically(&args.out, &bytes)?;
+    print(&map_report::as_text(&args.out, &updated, bytes.len() as u64))?;
     Ok(DONE.into())
 }

@@ -132,7 +132,7 @@ mod tests {
         assert_eq!(with_defaults.resolved(), config.resolved());
     }
 
-    const LEAST: &str = "[vehicle]\nname = \"car\"\n[camera]\ndriver = \"v4l2\"\ndevice = \"/dev/video0\"\n[map]\n\
+    const LEAST: &str = "[vehicle]\nname = \"car\"\n[camera]\ndriver = \"replay\"\nrecording = \"a.mcap\"\n[map]\n\
                          file = \"area.map\"\n";
 
     #[test]
@@ -140,7 +140,7 @@ mod tests {
         assert!(LocalizeConfig::parse(LEAST).is_ok());
         let table = [
             ("[map]\nfile = \"area.map\"", "", "the table [map] is missing"),
-            ("driver = \"v4l2\"\ndevice = \"/dev/video0\"", "driver = \"none\"", "localizing needs a camera"),
+            ("driver = \"replay\"\nrecording = \"a.mcap\"", "driver = \"none\"", "localizing needs a camera"),
             ("[map]", "[motion]\nspeed_limit_mps = 0.0\n[map]", "[motion]: speed_limit_mps = 0: expected 0.1 to 200"),
             ("[map]", "[motion]\nspeed_kmh = 3\n[map]", "[motion]: unknown field `speed_kmh`"),
             ("[map]", "[gnss]\ndriver = \"none\"\n[map]", "unknown table or key `gnss`, expected [vehicle]"),

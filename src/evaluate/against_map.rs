@@ -49,12 +49,14 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
         .map_init(Vec::new, |scratch, &row| {
             let mut fused = vec![0.0; map.cells.len()];
             let mut nowhere = Some(0.0);
+            let mut all_features = Vec::new();
             let mut estimates_m: Vec<PositionM> = fields
                 .iter()
                 .zip(&map.info.groups)
                 .zip(&features)
                 .map(|((field, info), features)| {
                     let z: Vec<f32> = (0..field.features()).map(|r| features[(row, r)] as f32).collect();
+                    all_features.extend_from_slice(&z);
                     let mut alone = vec![0.0; map.cells.len()];
                     field.add_log_likelihood(&z, info.recipe.noise, info.recipe.weight as f32, scratch, &mut alone);
                     fused.iter_mut().zip(&alone).for_each(|(sum, value)| *sum += value);
@@ -65,7 +67,7 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
                 .collect();
             estimates_m.push(locate(&map.cells, &fused, map.info.refine));
             let is_covered = covers(&map.cells, &fused, truth_m[row], map.info.temperature, 0.95);
-            Answer { estimates_m, is_covered, log_likelihood: fused, nowhere }
+            Answer { estimates_m, is_covered, features: all_features, log_likelihood: fused, nowhere }
         })
         .collect();
     let covered = answers.iter().filter(|answer| answer.is_covered).count() as f64 / survey.len().max(1) as f64;
@@ -104,6 +106,7 @@ struct Answer {
     /// One a group, and the fused one last.
     estimates_m: Vec<PositionM>,
     is_covered: bool,
+    features: Vec<f32>,
     log_likelihood: Vec<f32>,
     nowhere: Option<f32>,
 }
@@ -126,6 +129,7 @@ fn in_order(survey: &Survey, map: &FeatureMap, answers: &[Answer]) -> Vec<Sequen
             stamp_ns: frame.stamp_ns,
             log_likelihood: &answer.log_likelihood,
             nowhere: answer.nowhere,
+            features: &answer.features,
             compass: compass.unwrap_or(&[]),
         })
         .collect();

@@ -1,5 +1,7 @@
 //! Results as they are printed and written: one entry a recipe, type of features, split and seed.
 
+use std::f64::consts::{FRAC_PI_2, TAU};
+
 use serde::Serialize;
 
 use super::sequence::{Sequence, SequenceFigures};
@@ -62,6 +64,7 @@ pub struct FrameEntry {
     pub cov_ee_m2: Option<f64>,
     pub cov_en_m2: Option<f64>,
     pub cov_nn_m2: Option<f64>,
+    /// From north, clockwise, 0 to 2π.
     pub heading_rad: Option<f64>,
     pub state: Option<&'static str>,
 }
@@ -123,7 +126,9 @@ impl Entry {
             cov_ee_m2: pose.map(|pose| pose.covariance.ee_m2),
             cov_en_m2: pose.map(|pose| pose.covariance.en_m2),
             cov_nn_m2: pose.map(|pose| pose.covariance.nn_m2),
-            heading_rad: pose.and_then(|pose| pose.heading).map(|heading| heading.yaw_rad),
+            heading_rad: pose
+                .and_then(|pose| pose.heading)
+                .map(|heading| (FRAC_PI_2 - heading.yaw_rad).rem_euclid(TAU)),
             state: state.map(LocalizationState::name),
         });
         Self { frames: Some(frames.collect()), ..self }

@@ -20,6 +20,8 @@ pub struct Localizer {
     descriptors: Vec<Descriptor>,
     properties: Vec<Vec<f32>>,
     groups: Vec<Group>,
+    /// Of all groups, one behind the other.
+    features: Vec<f32>,
     log_likelihood: Vec<f32>,
     scratch: Vec<f32>,
     compass: Vec<i8>,
@@ -35,7 +37,6 @@ struct Group {
     field: FieldOnCells,
     noise: NoiseModel,
     weight: f32,
-    features: Vec<f32>,
 }
 
 /// The steps of a frame.
@@ -111,7 +112,6 @@ impl Localizer {
             field: FieldOnCells::of(group),
             noise: info.recipe.noise,
             weight: info.recipe.weight as f32,
-            features: vec![0.0; group.scaling.features()],
         });
         Ok(Self {
             decoder: LumaDecoder::new(),
@@ -121,6 +121,7 @@ impl Localizer {
             properties: Describer::room_for(&descriptors),
             groups: groups.collect(),
             descriptors,
+            features: vec![0.0; map.groups.iter().map(|group| group.scaling.features()).sum()],
             log_likelihood: vec![0.0; map.cells.len()],
             scratch: Vec::with_capacity(map.cells.len()),
             compass: vec![0; COMPASS_BYTES],
@@ -152,8 +153,14 @@ impl Localizer {
         watch.lap(Stage::Describe);
         let nowhere = self.match_cells();
         watch.lap(Stage::Match);
-        let observation =
-            Observation { sequence, stamp_ns, log_likelihood: &self.log_likelihood, nowhere, compass: &self.compass };
+        let observation = Observation {
+            sequence,
+            stamp_ns,
+            log_likelihood: &self.log_likelihood,
+            nowhere,
+            features: &self.features,
+            compass: &self.compass,
+        };
         let tracked = self.tracker.take(&observation);
         watch.lap(Stage::Track);
         self.timings.add(&watch);
@@ -173,20 +180,17 @@ impl Localizer {
     fn match_cells(&mut self) -> Option<f32> {
         self.log_likelihood.fill(0.0);
         let mut nowhere = Some(0.0);
-        for (group, properties) in self.groups.iter_mut().zip(&mut self.properties) {
+        let mut rest = self.features.as_mut_slice();
+        for (group, properties) in self.groups.iter().zip(&mut self.properties) {
+            let features;
+            (features, rest) = rest.split_at_mut(group.field.features());
             properties.iter_mut().zip(&group.mean).for_each(|(property, mean)| *property -= mean);
             let rows = group.projection.chunks_exact(properties.len());
-            group.features.iter_mut().zip(rows).for_each(|(feature, row)| *feature = dot(row, properties));
-            group.field.add_log_likelihood(
-                &group.features,
-                group.noise,
-                group.weight,
-                &mut self.scratch,
-                &mut self.log_likelihood,
-            );
-            nowhere = nowhere
-                .zip(group.field.log_likelihood_nowhere(&group.features, group.noise))
-                .map(|(sum, value)| sum + group.weight * value);
+            features.iter_mut().zip(rows).for_each(|(feature, row)| *feature = dot(row, properties));
+            let Group { field, noise, weight, .. } = group;
+            field.add_log_likelihood(features, *noise, *weight, &mut self.scratch, &mut self.log_likelihood);
+            let of_group = field.log_likelihood_nowhere(features, *noise);
+            nowhere = nowhere.zip(of_group).map(|(sum, value)| sum + weight * value);
         }
         nowhere
     }

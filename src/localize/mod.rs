@@ -7,8 +7,8 @@
 //!
 //! [`Localizer`] takes frames all the way; [`Tracker`] is the part from the log-likelihood on, which also serves drives
 //! that are evaluated offline, where [`smooth`] adds what later frames say of earlier ones. The likelihood is in
-//! `likelihood`, the discrete Bayes filter in `belief` and `tracker`, the motion between frames in `motion`, and when a
-//! position may be said in `state`.
+//! `likelihood`, the discrete Bayes filter in `belief` and `tracker`, the motion between frames in `motion`, what
+//! a frame is worth beside those before it in `news`, and when a position may be said in `state`.
 
 mod belief;
 mod estimate;
@@ -16,6 +16,7 @@ mod heading;
 mod likelihood;
 mod localizer;
 mod motion;
+mod news;
 mod smoother;
 mod state;
 mod tracker;

@@ -15,6 +15,8 @@ pub struct Motion {
 pub trait MotionModel: Send {
     /// The motion over the next `dt_s` seconds, at least 0.
     fn predict(&mut self, dt_s: f64) -> Motion;
+    /// The pictures show that the vehicle has been slower than this.
+    fn limit(&mut self, speed_mps: f64);
     /// What the last frame says of the position by itself. `None`: it is not known where the vehicle is, and motions so far
     /// mean nothing.
     fn observe(&mut self, seen: Option<&Mode>);
@@ -36,7 +38,7 @@ pub struct MotionSettings {
 
 impl Default for MotionSettings {
     fn default() -> Self {
-        Self { speed_limit_mps: 20.0, acceleration_mps2: 2.0, diffusion_m: 0.3 }
+        Self { speed_limit_mps: 20.0, acceleration_mps2: 3.0, diffusion_m: 0.3 }
     }
 }
 
@@ -75,6 +77,15 @@ struct Track {
     vv: f64,
 }
 
+impl Track {
+    fn slow_to(&mut self, limit_mps: f64) {
+        let speed_mps = self.velocity_mps[0].hypot(self.velocity_mps[1]);
+        if speed_mps > limit_mps {
+            self.velocity_mps = self.velocity_mps.map(|v| v * limit_mps / speed_mps);
+        }
+    }
+}
+
 impl ConstantVelocity {
     pub fn new(settings: MotionSettings) -> Self {
         Self { settings, track: None }
@@ -98,6 +109,13 @@ impl MotionModel for ConstantVelocity {
         Motion { mean_m, std_m: std_m.min(widest_m) }
     }
 
+    fn limit(&mut self, speed_mps: f64) {
+        let Some(track) = &mut self.track else { return };
+        track.slow_to(speed_mps);
+        track.vv = track.vv.min(speed_mps * speed_mps);
+        track.pv = track.pv.clamp(-(track.pp * track.vv).sqrt(), (track.pp * track.vv).sqrt());
+    }
+
     fn observe(&mut self, seen: Option<&Mode>) {
         let Some(seen) = seen else {
             self.track = None;
@@ -116,10 +134,7 @@ impl MotionModel for ConstantVelocity {
             track.position_m[axis] += gain_p * surprise_m;
             track.velocity_mps[axis] += gain_v * surprise_m;
         }
-        let speed_mps = track.velocity_mps[0].hypot(track.velocity_mps[1]);
-        if speed_mps > self.settings.speed_limit_mps {
-            track.velocity_mps = track.velocity_mps.map(|v| v * self.settings.speed_limit_mps / speed_mps);
-        }
+        track.slow_to(self.settings.speed_limit_mps);
         track.vv -= gain_v * track.pv;
         track.pv -= gain_p * track.pv;
         track.pp -= gain_p * track.pp;

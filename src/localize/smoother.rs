@@ -49,7 +49,7 @@ pub fn smooth(map: &FeatureMap, settings: MotionSettings, frames: &[Observation]
         .map(|(frame, after)| {
             // The drive the other way round.
             let reversed = Observation { stamp_ns: last_ns - frame.stamp_ns, ..*frame };
-            backward.advance(reversed.stamp_ns);
+            backward.advance(reversed.stamp_ns, None);
             let hill = backward.belief().product(after);
             backward.take(&reversed);
             backward.sighting(hill.mean_m)

@@ -37,7 +37,7 @@ const CONTRADICTED: f64 = 5.0;
 /// Sure for so many independent frames before a position is said.
 const SETTLED: f64 = 3.0;
 /// Weight of an independent frame in the mean resemblance.
-const RESEMBLANCE_WEIGHT: f64 = 0.25;
+const RESEMBLANCE_WEIGHT: f64 = 0.1;
 
 #[derive(Debug, Clone)]
 pub struct StateMachine {

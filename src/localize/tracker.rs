@@ -1,7 +1,8 @@
 //! From one frame to the next: the discrete Bayes filter, and what may be said of its belief.
 
 use super::belief::{Belief, Mode};
-use super::motion::{ConstantVelocity, MotionModel, MotionSettings};
+use super::motion::{ConstantVelocity, Motion, MotionModel, MotionSettings};
+use super::news::{News, Reach, Worth};
 use super::state::{Evidence, StateMachine};
 use crate::localize::{most_likely_cell, refined_m};
 use crate::map::{CandidateCells, Compass, FeatureMap};
@@ -19,15 +20,13 @@ pub struct Observation<'a> {
     pub log_likelihood: &'a [f32],
     /// The log-likelihood of a place the map knows nothing of; `None` where the map's recipe has none.
     pub nowhere: Option<f32>,
+    /// The features of all groups, one behind the other.
+    pub features: &'a [f32],
     /// The [signature](super::heading) of the panorama that headings are taken from.
     pub compass: &'a [i8],
 }
 
-/// Errors of frames that follow each other within this time are the same error: together they count as one frame \[s\].
-const SAME_ERROR_S: f64 = 0.33;
-/// A frame of the same instant as the one before it is worth this.
-const LEAST_SHARE: f64 = 1e-3;
-/// Mixed into the belief with every frame: nothing is ruled out for good.
+/// Mixed into the belief with every independent frame: nothing is ruled out for good.
 const DOUBT: f64 = 1e-4;
 /// And after a frame that contradicts those before it.
 const DOUBT_IN_CONTRADICTION: f64 = 0.5;
@@ -53,7 +52,10 @@ pub struct Tracker {
     last_stamp_ns: Option<u64>,
     /// Of the last frame that was not skipped.
     last_used_ns: Option<u64>,
-    /// What it was worth.
+    news: News,
+    /// Variance that motions have added since pictures show how far the vehicle can have come \[m²\].
+    wandered_m2: f64,
+    /// What the last frame was worth.
     last_share: f64,
     doubt: f64,
 }
@@ -90,14 +92,16 @@ impl Tracker {
             states: StateMachine::new(map.info.least_resemblance),
             last_stamp_ns: None,
             last_used_ns: None,
+            news: News::new(&map.info),
+            wandered_m2: 0.0,
             last_share: 1.0,
-            doubt: DOUBT,
+            doubt: 0.0,
         }
     }
 
     /// A frame that could not be used: only time has passed.
     pub fn skip(&mut self, sequence: u32, stamp_ns: u64) -> PositionEstimate {
-        self.advance(stamp_ns);
+        self.advance(stamp_ns, None);
         let mode = self.belief.mode();
         let state = self.states.state();
         let pose = (state == LocalizationState::Localized).then(|| self.pose(&mode, &[]));
@@ -107,11 +111,9 @@ impl Tracker {
 
     /// Takes a frame. Stamps must not fall; one that does counts as no time having passed.
     pub fn take(&mut self, frame: &Observation) -> Tracked {
-        self.advance(frame.stamp_ns);
+        let Worth { share, reach } = self.news.of(frame.stamp_ns, frame.features);
+        self.advance(frame.stamp_ns, reach);
         let expected = self.belief.mode();
-        // Frames that follow each other closely err alike; they share what one frame is worth.
-        let since_s = self.last_used_ns.map(|last| seconds(last, frame.stamp_ns));
-        let share = since_s.map_or(1.0, |since_s| (since_s / SAME_ERROR_S).clamp(LEAST_SHARE, 1.0));
         self.last_used_ns = Some(frame.stamp_ns);
         self.last_share = share;
         self.belief.weigh(frame.log_likelihood, (share / self.temperature) as f32);
@@ -123,7 +125,7 @@ impl Tracker {
             frame.nowhere.map(|nowhere| f64::from(frame.log_likelihood[best] - nowhere) / self.temperature);
         let evidence = Evidence { probability: mode.probability, contradiction, resemblance, share };
         let (state, warnings) = self.states.take(&evidence);
-        self.doubt = if warnings.contradiction { DOUBT_IN_CONTRADICTION } else { DOUBT };
+        self.doubt = if warnings.contradiction { DOUBT_IN_CONTRADICTION } else { DOUBT * share };
         self.follow(&mode);
 
         let single_frame_m = match self.refine {
@@ -147,18 +149,31 @@ impl Tracker {
         self.belief.seen_near(position_m, (1.0 / self.last_share) as f32)
     }
 
-    /// Moves the belief to the time of a frame, before what that frame says.
-    pub(super) fn advance(&mut self, stamp_ns: u64) {
+    /// Moves the belief to the time of a frame, before what that frame says; within `reach`, if pictures show one.
+    pub(super) fn advance(&mut self, stamp_ns: u64, reach: Option<Reach>) {
         let dt_s = self.last_stamp_ns.map_or(0.0, |last| seconds(last, stamp_ns));
         self.last_stamp_ns = Some(stamp_ns);
         if dt_s > 0.0 {
-            let motion = self.motion.predict(dt_s);
+            let motion = self.motion_within(dt_s, reach);
             self.belief.spread(motion.mean_m, motion.std_m);
         }
         self.belief.doubt(self.doubt);
+        self.doubt = 0.0;
         if self.last_used_ns.is_some_and(|last| seconds(last, stamp_ns) > BLIND_S) {
             self.states.lose();
         }
+    }
+
+    fn motion_within(&mut self, dt_s: f64, reach: Option<Reach>) -> Motion {
+        let Some(Reach { way_m, time_s }) = reach else {
+            self.wandered_m2 = 0.0;
+            return self.motion.predict(dt_s);
+        };
+        self.motion.limit(way_m / time_s.max(dt_s));
+        let Motion { mean_m, std_m } = self.motion.predict(dt_s);
+        let std_m = std_m.min((way_m * way_m - self.wandered_m2).max(0.0).sqrt());
+        self.wandered_m2 += std_m * std_m;
+        Motion { mean_m, std_m }
     }
 
     /// How much likelier the frame finds its best cell than any where the vehicle was expected to be, in nats; 0 where

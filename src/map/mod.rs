@@ -73,8 +73,8 @@ pub struct MapInfo {
     /// p(cell) ∝ exp(log-likelihood / temperature): learned from frames that were held back, whole recordings of them
     /// where there are several.
     pub temperature: f64,
-    /// Frames of places that are not in the map resemble their best cell less than this, but for one in a hundred: how much
-    /// likelier it is than no place, in nats at the map's temperature. `None` where the map cannot tell.
+    /// Frames that resemble their best cell less than this for a while are of no place in the map: how much likelier it is
+    /// than no place, in nats at the map's temperature. `None` where the map cannot tell.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub least_resemblance: Option<f64>,
     /// One standard deviation of headings, measured on the learning panoramas \[rad\]. `None` without a compass.

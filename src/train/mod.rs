@@ -15,6 +15,7 @@ mod survey;
 mod temperature;
 mod track;
 mod trial;
+mod update;
 
 pub use group::{LearnError, LearnedGroup};
 pub use split::{Split, SplitError};
@@ -23,6 +24,7 @@ pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
 pub use temperature::covers;
 pub use track::{Similarity, Smoothed, TrackSmoother};
 pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
+pub use update::{BeforeAndAfter, UpdateError, UpdateReport, update};
 
 use crate::gp::LearningPositions;
 use crate::map::{
