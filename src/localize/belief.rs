@@ -387,7 +387,7 @@ mod tests {
         belief.weigh(&hill_at(&cells, [20.1, 15.2], 1.0), 1.0);
         let mode = belief.mode();
         assert!((mode.mean_m[0] - 20.1).abs() < 0.01 && (mode.mean_m[1] - 15.2).abs() < 0.01, "{mode:?}");
-        let seen = belief.seen_near([19.0, 15.0], 1.0);
+        let seen = belief.seen_near([20.0, 15.0], 1.0);
         assert!((seen.mean_m[0] - 20.1).abs() < 0.01 && (seen.mean_m[1] - 15.2).abs() < 0.01, "{seen:?}");
         let on_cells = belief.on_cells(1e-6);
         let centers_m = cells.centers_m();

@@ -169,7 +169,7 @@ mod tests {
         }
         let motion = model.predict(0.5);
         assert!((motion.mean_m[0] - 3.0).abs() < 0.1 && (motion.mean_m[1] + 1.0).abs() < 0.1, "{motion:?}");
-        assert!(motion.std_m < 1.0, "{motion:?}");
+        assert!(motion.std_m < 2.0, "{motion:?}");
         model.observe(None);
         assert_eq!(model.velocity_mps(), None);
     }
@@ -180,7 +180,7 @@ mod tests {
         let run = |steps: u32| {
             let mut model = ConstantVelocity::new(MotionSettings::default());
             model.observe(Some(&seen([0.0, 0.0], 0.5)));
-            (0..steps).for_each(|_| drop(model.predict(1.0 / f64::from(steps))));
+            (0..steps).for_each(|_| _ = model.predict(1.0 / f64::from(steps)));
             let track = model.track.expect("a track");
             (track.pp, track.pv, track.vv)
         };
