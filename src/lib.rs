@@ -26,7 +26,7 @@
 //! | [`features`] | panorama → descriptor → features |
 //! | [`gp`] | Gaussian-process regression: pure mathematics |
 //! | [`map`] | what localizing needs to know of a place, and its file |
-//! | [`localize`] | features of one frame against the map |
+//! | [`localize`] | frames against the map: likelihood, filter, states, heading, smoother |
 //! | [`outputs`] | estimates → JSON lines and NMEA sentences, to whoever listens |
 //! | [`train`] | recordings → map: recipes, splits, selection |
 //! | [`metrics`] | error figures of position estimates |
