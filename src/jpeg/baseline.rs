@@ -5,8 +5,8 @@
 //! that damage anywhere is found, but chroma and blocks nobody needs are passed over several coefficients at a time.
 
 use super::bits::{Bits, REFILLED_BITS};
-use super::header::Header;
-use super::huffman::{AcTable, BlockTable, DcTable, MAX_SYMBOL_BITS, NoCode, Specification, WINDOW};
+use super::header::{Header, Specifications};
+use super::huffman::{AcTable, BlockTable, DcTable, MAX_SYMBOL_BITS, NoCode, WINDOW};
 use super::idct::{self, SIDE};
 use super::unstuff::Scan;
 use crate::types::{LumaImage, Tiles};
@@ -53,7 +53,7 @@ pub struct Baseline {
 /// The Huffman tables of all components.
 #[derive(Debug)]
 struct Tables {
-    specifications: Vec<[Specification; 2]>,
+    specifications: Specifications,
     /// One for each pair of specifications.
     distinct: Vec<ComponentTables>,
     /// The place in `distinct` for each component.
@@ -68,10 +68,10 @@ struct ComponentTables {
 }
 
 impl Tables {
-    fn new(specifications: Vec<[Specification; 2]>) -> Option<Self> {
+    fn new(specifications: Specifications) -> Option<Self> {
         let (mut distinct, mut of_component) = (Vec::new(), Vec::new());
-        for (component, pair) in specifications.iter().enumerate() {
-            let same = specifications[..component].iter().position(|earlier| earlier == pair);
+        for (component, pair) in specifications.iter().flatten().enumerate() {
+            let same = specifications[..component].iter().flatten().position(|earlier| earlier == pair);
             of_component.push(match same {
                 Some(same) => of_component[same],
                 None => {

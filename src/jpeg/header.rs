@@ -12,12 +12,18 @@ pub struct Header {
     pub components: usize,
     /// In the order of the file.
     pub luma_quantization: [u16; 64],
-    pub specifications: Vec<[Specification; 2]>,
+    /// The DC and AC tables of the first `components`.
+    pub specifications: Specifications,
     /// Minimum coded units between restart markers, 0 where there are none.
     pub restart_interval: usize,
     /// Where the scan begins.
     pub scan_start: usize,
 }
+
+/// One component after the other; `None` behind the last.
+pub type Specifications = [Option<[Specification; 2]>; MAX_COMPONENTS];
+
+const MAX_COMPONENTS: usize = 3;
 
 impl Header {
     /// Reads the headers; `None` when the frame is not plain, or not quite right.
@@ -25,7 +31,7 @@ impl Header {
         let mut rest = jpeg.strip_prefix(&[0xFF, 0xD8])?;
         let mut frame: Option<Frame> = None;
         let mut quantization: [Option<[u16; 64]>; 4] = [None; 4];
-        let mut huffman: [[Option<Specification>; 4]; 2] = Default::default();
+        let mut huffman = [[None; 4]; 2];
         let mut restart_interval = 0;
         loop {
             let (&[0xFF, marker, high, low], after) = rest.split_first_chunk()? else { return None };
@@ -45,7 +51,7 @@ impl Header {
                         width_px: frame.width_px,
                         height_px: frame.height_px,
                         luma_blocks: frame.luma_blocks,
-                        components: frame.components.len(),
+                        components: frame.components().len(),
                         luma_quantization: quantization[usize::from(frame.luma_quantization)]?,
                         specifications: frame.read_scan(body, &huffman)?,
                         restart_interval,
@@ -64,16 +70,21 @@ struct Frame {
     height_px: usize,
     luma_blocks: [usize; 2],
     luma_quantization: u8,
-    /// Their identifiers.
-    components: Vec<u8>,
+    /// Number of components, and their identifiers.
+    count: usize,
+    identifiers: [u8; MAX_COMPONENTS],
 }
 
 impl Frame {
     fn read(body: &[u8]) -> Option<Self> {
         let (&[8, h1, h0, w1, w0, count], components) = body.split_first_chunk()? else { return None };
         let (components, []) = components.as_chunks::<3>() else { return None };
-        let identifiers: Vec<u8> = components.iter().map(|component| component[0]).collect();
-        if usize::from(count) != components.len() || !matches!(count, 1 | 3) || identifiers == *b"RGB" {
+        if usize::from(count) != components.len() || !matches!(count, 1 | 3) {
+            return None;
+        }
+        let mut identifiers = [0; MAX_COMPONENTS];
+        identifiers.iter_mut().zip(components).for_each(|(identifier, component)| *identifier = component[0]);
+        if identifiers == *b"RGB" {
             return None;
         }
         let [_, sampling, luma_quantization] = components[0];
@@ -90,21 +101,31 @@ impl Frame {
             height_px: usize::from(u16::from_be_bytes([h1, h0])),
             luma_blocks,
             luma_quantization,
-            components: identifiers,
+            count: usize::from(count),
+            identifiers,
         })
     }
 
+    /// Identifiers.
+    fn components(&self) -> &[u8] {
+        &self.identifiers[..self.count]
+    }
+
     /// The DC and AC tables of every component, from a scan header: T.81, B.2.3.
-    fn read_scan(&self, body: &[u8], huffman: &[[Option<Specification>; 4]; 2]) -> Option<Vec<[Specification; 2]>> {
+    fn read_scan(&self, body: &[u8], huffman: &[[Option<Specification>; 4]; 2]) -> Option<Specifications> {
         let (&count, rest) = body.split_first()?;
         let (selectors, rest) = rest.split_at_checked(2 * usize::from(count))?;
         let selectors = selectors.as_chunks::<2>().0;
-        let in_order = selectors.iter().map(|&[identifier, _]| identifier).eq(self.components.iter().copied());
+        let in_order = selectors.iter().map(|&[identifier, _]| identifier).eq(self.components().iter().copied());
         if !in_order || *rest != [0, 63, 0] {
             return None;
         }
-        let table = |class: usize, index: u8| huffman[class].get(usize::from(index))?.clone();
-        selectors.iter().map(|&[_, tables]| Some([table(0, tables >> 4)?, table(1, tables & 15)?])).collect()
+        let table = |class: usize, index: u8| *huffman[class].get(usize::from(index))?;
+        let mut specifications = [None; MAX_COMPONENTS];
+        for (specification, &[_, tables]) in specifications.iter_mut().zip(selectors) {
+            *specification = Some([table(0, tables >> 4)?, table(1, tables & 15)?]);
+        }
+        Some(specifications)
     }
 }
 
@@ -123,9 +144,9 @@ fn read_huffman(mut body: &[u8], tables: &mut [[Option<Specification>; 4]; 2]) -
     while let Some((&class_and_index, rest)) = body.split_first() {
         let (&counts, rest) = rest.split_first_chunk::<16>()?;
         let count: usize = counts.iter().map(|&count| usize::from(count)).sum();
-        let (symbols, rest) = rest.split_at_checked(count).filter(|_| count <= 256)?;
+        let (symbols, rest) = rest.split_at_checked(count)?;
         let table = tables.get_mut(usize::from(class_and_index >> 4))?.get_mut(usize::from(class_and_index & 15))?;
-        *table = Some(Specification { counts, symbols: symbols.to_vec() });
+        *table = Some(Specification::new(counts, symbols)?);
         body = rest;
     }
     Some(())

@@ -18,12 +18,22 @@ pub const MAX_SYMBOL_BITS: u32 = MAX_CODE_BITS + 15;
 pub struct NoCode;
 
 /// A table as the file has it: ITU-T T.81, B.2.4.2.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Specification {
     /// Number of codes of each length 1..=16.
-    pub counts: [u8; 16],
-    /// Symbols in the order of their codes.
-    pub symbols: Vec<u8>,
+    counts: [u8; 16],
+    /// Symbols in the order of their codes; zeros behind the last.
+    symbols: [u8; 256],
+}
+
+impl Specification {
+    /// `None` where there are not as many symbols as codes, or more than 256.
+    pub fn new(counts: [u8; 16], symbols: &[u8]) -> Option<Self> {
+        let count: usize = counts.iter().map(|&count| usize::from(count)).sum();
+        let mut padded = [0; 256];
+        padded.get_mut(..count).filter(|_| symbols.len() == count)?.copy_from_slice(symbols);
+        Some(Self { counts, symbols: padded })
+    }
 }
 
 /// Canonical decoding, T.81, F.2.2.3: any code, one at a time.
@@ -33,7 +43,7 @@ struct Canonical {
     end: [u32; MAX_CODE_BITS as usize],
     /// What to add to a code of each length to have its place among the symbols.
     offset: [i32; MAX_CODE_BITS as usize],
-    symbols: Vec<u8>,
+    symbols: [u8; 256],
 }
 
 /// A symbol with its code.
@@ -70,11 +80,7 @@ impl Canonical {
             end[i] = code << (MAX_CODE_BITS - length);
             code <<= 1;
         }
-        (place as usize == specification.symbols.len()).then(|| Self {
-            end,
-            offset,
-            symbols: specification.symbols.clone(),
-        })
+        Some(Self { end, offset, symbols: specification.symbols })
     }
 
     /// The symbol whose code the highest of the 64 `bits` begin with.
