@@ -78,27 +78,75 @@ def reduced(panorama, factor):
     return cv2.resize(panorama, (COLUMNS // factor, ROWS // factor), interpolation=cv2.INTER_AREA)
 
 
-def gradients(factor, blur, contrast, bands):
+def orientations(panorama, factor, blur, contrast, bands):
+    """h_b(e, a) of src/features/gradient.rs: 12 x band x column."""
+    log = blurred(np.log(reduced(panorama, factor) + 16), blur)
+    rows, columns = log.shape
+    east = 0.5 * (np.roll(log, -1, 1) - np.roll(log, 1, 1))
+    padded = np.pad(log, ((1, 1), (0, 0)), "edge")
+    down = 0.5 * (padded[2:] - padded[:-2])
+    norm, direction = cv2.cartToPolar(east, down)
+    weight = norm / (blurred(norm, contrast) + 0.05)
+    turn = direction * (12 / TAU)
+    lower = turn.astype(int)
+    share = turn - lower
+    at = (np.arange(rows) * bands // rows)[:, None] * columns + np.arange(columns)
+    size = bands * columns
+    bins = np.bincount((lower % 12 * size + at).ravel(), (weight * (1 - share)).ravel(), 12 * size)
+    bins += np.bincount(((lower + 1) % 12 * size + at).ravel(), (weight * share).ravel(), 12 * size)
+    return bins.reshape(12, bands, columns) / (rows // bands)
+
+
+def gradients(*sizes):
     """src/features/gradient.rs before the magnitudes: bin x band x harmonic."""
 
     def describe(panorama):
-        log = blurred(np.log(reduced(panorama, factor) + 16), blur)
-        rows, columns = log.shape
-        east = 0.5 * (np.roll(log, -1, 1) - np.roll(log, 1, 1))
-        padded = np.pad(log, ((1, 1), (0, 0)), "edge")
-        down = 0.5 * (padded[2:] - padded[:-2])
-        norm, direction = cv2.cartToPolar(east, down)
-        weight = norm / (blurred(norm, contrast) + 0.05)
-        turn = direction * (12 / TAU)
-        lower = turn.astype(int)
-        share = turn - lower
-        at = (np.arange(rows) * bands // rows)[:, None] * columns + np.arange(columns)
-        size = bands * columns
-        bins = np.bincount((lower % 12 * size + at).ravel(), (weight * (1 - share)).ravel(), 12 * size)
-        bins += np.bincount(((lower + 1) % 12 * size + at).ravel(), (weight * share).ravel(), 12 * size)
-        return np.fft.rfft(bins.reshape(12, bands, columns), axis=2)[:, :, :13] / columns / (rows // bands)
+        bins = orientations(panorama, *sizes)
+        return np.fft.rfft(bins, axis=2)[:, :, :13] / bins.shape[2]
 
     return describe
+
+
+def waves():
+    """Orthonormal waves of a patch, 16 cells x 12 orientations, by 30."""
+    cosine = lambda u: np.sqrt((2 if u else 1) / 4) * np.cos(np.pi * (np.arange(4) + 0.5) * u / 4)
+    turn = TAU * np.arange(12) / 12
+    around = [(0, np.full(12, np.sqrt(1 / 12)))]
+    for m in (1, 2, 3):
+        around += [(m, np.sqrt(2 / 12) * np.cos(m * turn)), (m, np.sqrt(2 / 12) * np.sin(m * turn))]
+    orders = [(u, v, m, wave) for u in range(4) for v in range(4) for m, wave in around if u + v + m <= 3]
+    return np.array([np.einsum("i,j,b->ijb", cosine(u), cosine(v), wave).ravel() for u, v, _, wave in orders]).T
+
+
+def patches(panorama):
+    """src/features/patches.rs: 416 x 31."""
+    cells = orientations(panorama, 2, 1.0, 8.0, 32).reshape(12, 16, 2, 64, 4).mean((2, 4))
+    cells = 0.25 * np.roll(cells, 1, 2) + 0.5 * cells + 0.25 * np.roll(cells, -1, 2)
+    rows, columns = np.arange(13), np.arange(0, 64, 2)
+    parts = [cells[:, rows[:, None] + i, (columns + j) % 64] for i in range(4) for j in range(4)]
+    parts = np.concatenate(parts).reshape(192, -1)
+    coefficients = np.sqrt(parts / (parts.sum(0) + 16 * 0.3)).T @ waves()
+    return np.column_stack([coefficients, np.repeat(rows / 12 - 0.5, 32)]).astype(np.float32)
+
+
+FREQUENCIES = np.random.default_rng(0).standard_normal((31, 1024)).astype(np.float32) / 0.35
+PHASES = np.random.default_rng(1).uniform(0, TAU, 1024).astype(np.float32)
+WORDS = Path(__file__).parents[2] / "src/features/words.bin"
+
+
+def kernel_mean(x):
+    return np.cos(x @ FREQUENCIES + PHASES).mean(0)
+
+
+def patch_words(x):
+    """src/features/words.rs."""
+    words = np.fromfile(WORDS, np.int8).reshape(-1, 31).astype(np.float32) / 128
+    square = (words**2).sum(1) - 2 * x @ words.T
+    share = np.exp(-60 * (square - square.min(1, keepdims=True)))
+    share /= share.sum(1, keepdims=True)
+    residual = share.T @ x - share.sum(0)[:, None] * words
+    residual /= np.linalg.norm(residual, axis=1, keepdims=True) + 0.01
+    return residual.ravel() / np.sqrt(len(words))
 
 
 def row_fourier(panorama):
@@ -117,7 +165,14 @@ def census(panorama):
     return np.fft.rfft(np.array(planes, float).reshape(8, 32, 2, -1).mean(2), axis=2)[:, :, :13] / log.shape[1]
 
 
-PLANES = {"fine": gradients(2, 1.0, 8.0, 32), "coarse": gradients(4, 1.5, 4.0, 16), "rows": row_fourier, "census": census}
+PLANES = {
+    "fine": gradients(2, 1.0, 8.0, 32),
+    "coarse": gradients(4, 1.5, 4.0, 16),
+    "rows": row_fourier,
+    "census": census,
+    "patches": lambda panorama: kernel_mean(patches(panorama)),
+    "patch-words": lambda panorama: patch_words(patches(panorama)),
+}
 # Feature type: planes, opposite bins added, harmonics.
 SIGNATURES = {
     "gradient": ("fine", False, 5),
@@ -126,10 +181,14 @@ SIGNATURES = {
     "row-fourier": ("rows", False, 13),
     "census": ("census", False, 9),
 }
-DEFAULT = ("gradient", "gradient-unsigned", "gradient-coarse")
+DEFAULT = ("gradient", "gradient-unsigned", "gradient-coarse", "patches", "patch-words")
+# Added to the noise, as a share of its mean eigenvalue.
+RIDGE = {"patch-words": 2.0}
 
 
 def signature(planes, name, harmonics, bands=slice(None)):
+    if name not in SIGNATURES:
+        return planes[name]
     plane, unsigned, default_harmonics = SIGNATURES[name]
     spectrum = planes[plane]
     count = spectrum.shape[-2]
@@ -165,7 +224,7 @@ NOT_KNOWING = {"unknown-scale": 0.5, "fully charged": 1.0, "scaled-variance": 0.
 class Group:
     """src/train/noise_whitening.rs and the Gaussian processes of the features it finds, on the cells."""
 
-    def __init__(self, properties, changes, at, cells, o):
+    def __init__(self, properties, changes, at, cells, o, ridge=0.05):
         n, self.mean = len(at), properties.mean(0)
         u, d, vt = np.linalg.svd(properties - self.mean, full_matrices=False)
         rank = int((d > 1e-5 * d[0]).sum())
@@ -182,7 +241,7 @@ class Group:
         if o["perturbations"]:
             projected = changes @ basis
             noise += projected.T @ projected / len(projected)
-        noise += 0.05 * np.trace(noise) / rank * np.eye(rank)
+        noise += ridge * np.trace(noise) / rank * np.eye(rank)
         strength, directions = eigh(z.T @ z / n, noise)
         directions = directions[:, np.argsort(-strength)[: o["features"]]]
         self.projection = basis @ directions
@@ -225,8 +284,9 @@ TABLE = {
     "all of eq. 10's log variance": dict(noise="fully charged"),
     "eq. 10": dict(noise="gaussian"),
     "no perturbations": dict(perturbations=False),
-    **{f"{name} alone": dict(signatures=(name,)) for name in SIGNATURES},
-    "without gradient-unsigned": dict(signatures=("gradient", "gradient-coarse")),
+    **{f"{name} alone": dict(signatures=(name,)) for name in (*SIGNATURES, "patches", "patch-words")},
+    **{f"without {one}": dict(signatures=tuple(name for name in DEFAULT if name != one)) for one in DEFAULT},
+    "without patches and patch-words": dict(signatures=DEFAULT[:3]),
     "with row-fourier": dict(signatures=(*DEFAULT, "row-fourier")),
     "with census": dict(signatures=(*DEFAULT, "census")),
     "3 harmonics": dict(harmonics=3),
@@ -277,8 +337,8 @@ def main():
         of = lambda planes: [signature(planes, one, o["harmonics"], o["bands"]) for one in o["signatures"]]
         learned = [one[every] for one in of(clean)]
         groups = [] if TABLE[name] is None else [
-            Group(here, (there[every] - here[:, None]).reshape(-1, here.shape[1]), at, cells, o)
-            for here, there in zip(learned, of(again))
+            Group(here, (there[every] - here[:, None]).reshape(-1, here.shape[1]), at, cells, o, RIDGE.get(name, 0.05))
+            for name, here, there in zip(o["signatures"], learned, of(again))
         ]
         figures = []
         for planes, truth in days:
@@ -294,4 +354,5 @@ def main():
         print(f"{name:38} {rmse:7.3f} {median:7.3f} {p95:7.2f} {100 * over:6.1f}%", flush=True)
 
 
-main()
+if __name__ == "__main__":
+    main()

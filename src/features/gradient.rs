@@ -9,7 +9,7 @@ use realfft::{RealFftPlanner, RealToComplex};
 use crate::panorama::{Panorama, WIDE_COLUMNS, WIDE_ROWS};
 
 /// Orientation bins over the full circle: a dark-to-bright edge is not a bright-to-dark one.
-const BINS: usize = 12;
+pub const BINS: usize = 12;
 /// Azimuthal harmonics kept, from 0.
 const HARMONICS: usize = 5;
 
@@ -54,6 +54,9 @@ pub struct Sizes {
 
 /// 256 × 64 pixels in 32 bands.
 pub const FINE: Sizes = Sizes { reduction: 2, bands: 32, blur_px: 1.0, contrast_px: 8.0 };
+/// Columns and bands of [`FINE`].
+pub const FINE_COLUMNS: usize = WIDE_COLUMNS / FINE.reduction;
+pub const FINE_BANDS: usize = FINE.bands;
 /// 128 × 32 pixels in 16 bands.
 pub const COARSE: Sizes = Sizes { reduction: 4, bands: 16, blur_px: 1.5, contrast_px: 4.0 };
 
@@ -91,6 +94,7 @@ pub struct GradientSignature {
     north: Vec<f32>,
     local_mean: Vec<f32>,
     bins: Vec<f32>,
+    row: Vec<f32>,
     /// The first harmonics of every row of `bins`: bin × band × harmonic.
     harmonics: Vec<Complex<f32>>,
     /// The harmonics that a compass needs: bin × band × harmonic.
@@ -124,6 +128,7 @@ impl GradientSignature {
             bins: vec![0.0; BINS * sizes.bands * columns],
             harmonics: vec![Complex::default(); BINS * sizes.bands * HARMONICS],
             compass: vec![Complex::default(); COMPASS_BINS * COMPASS_BANDS * COMPASS_HARMONICS],
+            row: vec![0.0; columns],
             spectrum: transform.make_output_vec(),
             fft_scratch: transform.make_scratch_vec(),
             transform,
@@ -138,6 +143,11 @@ impl GradientSignature {
         blur(&mut self.local_mean, &mut self.scratch, self.columns, &self.contrast);
         self.gather_orientations();
         self.transform_bands();
+    }
+
+    /// h_b(e, a) of the panorama last looked at, bin × band × azimuth.
+    pub fn orientations(&self) -> &[f32] {
+        &self.bins
     }
 
     /// The signature of the panorama last looked at.
@@ -236,10 +246,12 @@ impl GradientSignature {
     fn transform_bands(&mut self) {
         let bands = self.sizes.bands;
         self.compass.fill(Complex::default());
-        let rows = self.bins.chunks_exact_mut(self.columns);
+        let rows = self.bins.chunks_exact(self.columns);
         for (i, (row, harmonics)) in rows.zip(self.harmonics.chunks_exact_mut(HARMONICS)).enumerate() {
+            // The transform overwrites what it reads.
+            self.row.copy_from_slice(row);
             self.transform
-                .process_with_scratch(row, &mut self.spectrum, &mut self.fft_scratch)
+                .process_with_scratch(&mut self.row, &mut self.spectrum, &mut self.fft_scratch)
                 .expect("the buffers come from the plan");
             harmonics.copy_from_slice(&self.spectrum[..HARMONICS]);
             let (bin, band) = (i / bands % COMPASS_BINS, i % bands * COMPASS_BANDS / bands);

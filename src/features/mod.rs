@@ -6,8 +6,10 @@
 mod fft;
 mod gradient;
 mod histogram;
+mod patches;
 pub mod scaling;
 mod steerable;
+mod words;
 
 use std::fmt;
 use std::str::FromStr;
@@ -17,7 +19,9 @@ use serde::{Deserialize, Serialize};
 use crate::panorama::Panorama;
 pub use gradient::{COMPASS_BYTES, COMPASS_HARMONICS};
 use gradient::{GradientSignature, Sign};
+use patches::{KernelMean, Patches};
 use steerable::{Response, SteerablePyramid};
+use words::PatchWords;
 
 /// A kind of image properties.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -41,10 +45,14 @@ pub enum Descriptor {
     GradientUnsigned,
     /// [`Descriptor::Gradient`] at half the resolution.
     GradientCoarse,
+    /// Kernel mean of the patches all around.
+    Patches,
+    /// Patches aggregated by what they resemble.
+    PatchWords,
 }
 
 impl Descriptor {
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 11] = [
         Self::Fft,
         Self::Hist,
         Self::HistSqrt,
@@ -54,6 +62,8 @@ impl Descriptor {
         Self::Gradient,
         Self::GradientUnsigned,
         Self::GradientCoarse,
+        Self::Patches,
+        Self::PatchWords,
     ];
     /// The three the paper evaluates.
     pub const PAPER: [Self; 3] = [Self::Fft, Self::Hist, Self::Sp];
@@ -67,6 +77,8 @@ impl Descriptor {
             Self::Gradient => gradient::FINE.dimensions(Sign::Signed),
             Self::GradientUnsigned => gradient::FINE.dimensions(Sign::Unsigned),
             Self::GradientCoarse => gradient::COARSE.dimensions(Sign::Signed),
+            Self::Patches => patches::DIMENSIONS,
+            Self::PatchWords => words::DIMENSIONS,
         }
     }
 
@@ -82,6 +94,8 @@ impl Descriptor {
             Self::Gradient => "gradient",
             Self::GradientUnsigned => "gradient-unsigned",
             Self::GradientCoarse => "gradient-coarse",
+            Self::Patches => "patches",
+            Self::PatchWords => "patch-words",
         }
     }
 }
@@ -127,6 +141,9 @@ pub struct Describer {
     pyramid: SteerablePyramid<f32>,
     gradient: GradientSignature,
     gradient_coarse: GradientSignature,
+    patches: Patches,
+    kernel_mean: KernelMean,
+    words: PatchWords,
 }
 
 impl Default for Describer {
@@ -142,6 +159,9 @@ impl Describer {
             pyramid: SteerablePyramid::new(),
             gradient: GradientSignature::new(gradient::FINE),
             gradient_coarse: GradientSignature::new(gradient::COARSE),
+            patches: Patches::new(),
+            kernel_mean: KernelMean::new(),
+            words: PatchWords::new(),
         }
     }
 
@@ -151,8 +171,12 @@ impl Describer {
     /// When one of `properties` is not [`Descriptor::dimensions`] long.
     pub fn describe(&mut self, descriptors: &[Descriptor], panorama: &Panorama, properties: &mut [Vec<f32>]) {
         let wanted = |of: &[Descriptor]| descriptors.iter().any(|descriptor| of.contains(descriptor));
-        if wanted(&[Descriptor::Gradient, Descriptor::GradientUnsigned]) {
+        const OF_PATCHES: [Descriptor; 2] = [Descriptor::Patches, Descriptor::PatchWords];
+        if wanted(&[Descriptor::Gradient, Descriptor::GradientUnsigned]) || wanted(&OF_PATCHES) {
             self.gradient.look(panorama);
+        }
+        if wanted(&OF_PATCHES) {
+            self.patches.look(self.gradient.orientations());
         }
         if wanted(&[Descriptor::GradientCoarse]) {
             self.gradient_coarse.look(panorama);
@@ -169,6 +193,8 @@ impl Describer {
                 Descriptor::Gradient => self.gradient.describe(Sign::Signed, properties),
                 Descriptor::GradientUnsigned => self.gradient.describe(Sign::Unsigned, properties),
                 Descriptor::GradientCoarse => self.gradient_coarse.describe(Sign::Signed, properties),
+                Descriptor::Patches => self.kernel_mean.describe(self.patches.all(), properties),
+                Descriptor::PatchWords => self.words.describe(self.patches.all(), properties),
             }
         }
     }

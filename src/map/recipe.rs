@@ -129,9 +129,13 @@ impl Recipe {
     }
 
     fn default_over(descriptors: &[Descriptor]) -> Self {
-        let model =
-            Model::SharedField(NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.5, ridge: 0.05 });
-        let group = |&descriptor| GroupRecipe { descriptor, model, noise: NoiseModel::UnknownScale, weight: 1.0 };
+        let group = |&descriptor| {
+            // Words vary in thousands of ways, of which few learning images see few: they are taken nearly as they are.
+            let ridge = if descriptor == Descriptor::PatchWords { 2.0 } else { 0.05 };
+            let settings = NoiseWhiteningSettings { features: 96, length_scale_spacings: 1.5, ridge };
+            let model = Model::SharedField(settings);
+            GroupRecipe { descriptor, model, noise: NoiseModel::UnknownScale, weight: 1.0 }
+        };
         Self {
             name: RecipeName::Default,
             groups: descriptors.iter().map(group).collect(),
@@ -158,7 +162,13 @@ impl Recipe {
 }
 
 /// Descriptors of the default recipe.
-const DEFAULT: [Descriptor; 3] = [Descriptor::Gradient, Descriptor::GradientUnsigned, Descriptor::GradientCoarse];
+const DEFAULT: [Descriptor; 5] = [
+    Descriptor::Gradient,
+    Descriptor::GradientUnsigned,
+    Descriptor::GradientCoarse,
+    Descriptor::Patches,
+    Descriptor::PatchWords,
+];
 /// Perturbed copies of every learning image.
 pub const PERTURBED_COPIES: usize = 2;
 
