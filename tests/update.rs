@@ -12,7 +12,7 @@ use common::{
 fn recording(folder: &Path, name: &str, extra: &[&str]) -> std::path::PathBuf {
     let [dataset, recording] = [name.to_owned(), format!("{name}.mcap")].map(|name| folder.join(name));
     omniloc()
-        .args(["simulate", "--world", "corridor", "--frames", "60", "--size", "320x180"])
+        .args(["simulate", "--world", "corridor", "--size", "320x180", "--position-std-m", "0"])
         .args(extra)
         .arg("--out")
         .arg(&dataset)
@@ -30,7 +30,7 @@ fn update(recording: &Path, out: &Path, extra: &[&str]) -> assert_cmd::assert::A
 fn another_day_is_added_and_what_it_does_is_said() {
     let temporary = tempfile::tempdir().expect("a temporary folder");
     let out = temporary.path().join("both.map");
-    let other_day = recording(temporary.path(), "other-day", &["--seed", SEED, "--day", "2"]);
+    let other_day = recording(temporary.path(), "other-day", &["--seed", SEED, "--day", "2", "--frames", "60"]);
     let done = update(&other_day, &out, &[]).success();
     let text = String::from_utf8_lossy(&done.get_output().stdout).into_owned();
     for words in ["added           60 frames", "of the map, before", "of the map, after", "of the drive, after"] {
@@ -51,7 +51,7 @@ fn another_day_is_added_and_what_it_does_is_said() {
 fn a_drive_that_spoils_the_map_is_not_added_unless_asked_for() {
     let temporary = tempfile::tempdir().expect("a temporary folder");
     let out = temporary.path().join("spoiled.map");
-    let other_place = recording(temporary.path(), "other-place", &["--seed", "99"]);
+    let other_place = recording(temporary.path(), "other-place", &["--seed", "99", "--frames", "120"]);
     let refused = update(&other_place, &out, &[]).code(1);
     let message = String::from_utf8_lossy(&refused.get_output().stderr).into_owned();
     assert!(message.contains("worse") && message.contains("--even-if-worse"), "{message}");

@@ -67,7 +67,7 @@ pub struct Args {
     #[arg(long, value_name = "M", value_parser = parse_spacing_m)]
     pub spacing_m: Option<f64>,
     /// Correct the recorded positions before learning, by how the vehicle moved and by places seen more than once
-    /// [default: track for the default recipe, none for the paper's]
+    /// [default: track for the default recipe, none for the paper's and with --update]
     #[arg(long, value_enum)]
     pub smooth: Option<Smoothing>,
     /// Replace the output if it exists
@@ -143,7 +143,8 @@ fn add_drive(args: &Args, old: &Path) -> anyhow::Result<ExitCode> {
     map.info
         .check_lens(&survey.calibration, survey.image_size_px)
         .with_context(|| format!("{} into {}", recording.path.display(), old.display()))?;
-    let smoothing = args.smooth.unwrap_or(Smoothing::usual(map.info.recipe));
+    // Without other passes to compare with, smoothing one drive brings little.
+    let smoothing = args.smooth.unwrap_or(Smoothing::None);
     let (updated, report) = update(&map, &survey, &recording.name, smoothing)
         .with_context(|| format!("adding {} to {}", recording.path.display(), old.display()))?;
     progress.finish();

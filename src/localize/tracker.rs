@@ -35,6 +35,8 @@ const FITTING_STDS: f64 = 3.0;
 const FITTING_STEPS: f64 = 3.0;
 /// Without a usable frame for so long, a position must be found anew \[s\].
 const BLIND_S: f64 = 1.5;
+/// Somewhere is expected if it is more likely than not.
+const EXPECTED: f64 = 0.5;
 /// The place of a frame is looked for by itself once the belief has so much of its probability in one hill.
 const TRACKED: f64 = 0.95;
 
@@ -179,7 +181,7 @@ impl Tracker {
     /// How much likelier the frame finds its best cell than any where the vehicle was expected to be, in nats; 0 where
     /// nothing was expected.
     fn contradiction(&self, log_likelihood: &[f32], best: usize, expected: &Mode) -> f64 {
-        if expected.probability < TRACKED {
+        if expected.probability < EXPECTED {
             return 0.0;
         }
         let PositionCovariance { ee_m2, nn_m2, .. } = expected.covariance;

@@ -1,5 +1,6 @@
 //! Camera image → panorama, by a table made once per calibration.
 
+use std::cell::RefCell;
 use std::f64::consts::TAU;
 
 use multiversion::multiversion;
@@ -50,6 +51,11 @@ const GATHERED: usize = 2 * TILE_COLUMNS;
 
 /// Bilinear samples further apart than this skip pixels \[px\].
 const MAX_SPACING_PX: f64 = 2.1;
+
+thread_local! {
+    /// The samples of one row of a tile, and their means: kept, so that a frame costs no allocation.
+    static BUFFERS: RefCell<[Vec<f32>; 2]> = const { RefCell::new([Vec::new(), Vec::new()]) };
+}
 
 impl UnwrapTable {
     /// The table for images of `width_px` × `height_px`.
@@ -137,23 +143,34 @@ impl UnwrapTable {
     /// As [`to_panorama`](Self::to_panorama).
     pub fn unwrap_into(&self, image: &LumaImage, shift_columns: usize, panorama: &mut Panorama) {
         assert_eq!((image.width_px, image.height_px), self.image_size_px(), "the table is for another image size");
+        BUFFERS.with_borrow_mut(|buffers| self.unwrap_with(buffers, image, shift_columns, panorama));
+    }
+
+    fn unwrap_with(
+        &self,
+        [values, means]: &mut [Vec<f32>; 2],
+        image: &LumaImage,
+        shift_columns: usize,
+        panorama: &mut Panorama,
+    ) {
         panorama.column_means.fill(0.0);
         panorama.wide.fill(0.0);
         let per_wide_row = 2 * self.sub_rows * self.sub_columns * TILE_COLUMNS;
-        let (mut values, mut means) = (vec![0.0; per_wide_row], vec![0.0; per_wide_row / self.sub_columns]);
+        values.resize(per_wide_row, 0.0);
+        means.resize(per_wide_row / self.sub_columns, 0.0);
         for (tile, samples) in self.samples.chunks_exact(WIDE_ROWS * per_wide_row).enumerate() {
             let first_column = (tile * TILE_COLUMNS + shift_columns) % SAMPLED_COLUMNS;
             let mut column_sums = [0.0; TILE_COLUMNS];
             for (samples, wide) in samples.chunks_exact(per_wide_row).zip(panorama.wide.chunks_exact_mut(WIDE_COLUMNS))
             {
-                sample_pixels(samples, &image.pixels, self.image_width_px, &mut values);
+                sample_pixels(samples, &image.pixels, self.image_width_px, values);
                 let sums = if self.sub_columns == 1 {
-                    sums_of_rows(&values)
+                    sums_of_rows(values)
                 } else {
                     for (mean, group) in means.iter_mut().zip(values.chunks_exact(self.sub_columns)) {
                         *mean = group.iter().sum::<f32>() / self.sub_columns as f32;
                     }
-                    sums_of_rows(&means)
+                    sums_of_rows(means)
                 };
                 column_sums.iter_mut().zip(&sums).for_each(|(column, sum)| *column += sum);
                 add_in_pairs(&sums, first_column, wide);

@@ -148,18 +148,17 @@ pub fn update(
     Ok((FeatureMap { info, positions_m: joined.positions_m, cells, groups, compass }, report))
 }
 
+/// The positions to learn from: as recorded, unless they are to be smoothed; refused where they err too much.
 fn smoothed(survey: &Survey, smoothing: Smoothing) -> Result<(Vec<PositionM>, Option<TrackReport>), UpdateError> {
     let recorded_m = survey.positions_m();
-    if smoothing == Smoothing::None {
-        return Ok((recorded_m, None));
-    }
     let smoothed = TrackSmoother::new(survey, &recorded_m).smoothed(&[], None);
     let track = smoothed.reports.first().copied();
-    match track {
-        Some(TrackReport::Smoothed { remaining_std_m, .. }) if remaining_std_m > MAX_POSITION_STD_M => {
+    match (track, smoothing) {
+        (Some(TrackReport::Smoothed { remaining_std_m, .. }), _) if remaining_std_m > MAX_POSITION_STD_M => {
             Err(UpdateError::PoorPositions { std_m: remaining_std_m })
         }
-        _ => Ok((smoothed.positions_m, track)),
+        (_, Smoothing::None) => Ok((recorded_m, None)),
+        (track, Smoothing::Track) => Ok((smoothed.positions_m, track)),
     }
 }
 

@@ -20,8 +20,14 @@ pub fn folder() -> &'static Path {
             let folder = tempfile::tempdir().expect("a temporary folder");
             let [dataset, recording, map] =
                 ["dataset", "survey.mcap", "corridor.map"].map(|name| folder.path().join(name));
-            let size = ["--world", "corridor", "--seed", SEED, "--frames", "120", "--size", "320x180", "--out"];
-            omniloc().arg("simulate").args(size).arg(&dataset).assert().success();
+            let size = ["--world", "corridor", "--seed", SEED, "--frames", "120", "--size", "320x180"];
+            omniloc()
+                .arg("simulate")
+                .args(size)
+                .args(["--position-std-m", "0", "--out"])
+                .arg(&dataset)
+                .assert()
+                .success();
             omniloc().arg("import").arg(&dataset).arg("--out").arg(&recording).assert().success();
             omniloc().arg("train").arg(&recording).args(["--grid-step-m", "0.2", "--out"]).arg(&map).assert().success();
             folder
