@@ -164,7 +164,7 @@ mod tests {
         assert_eq!(first.mean_m, [0.0; 2]);
         assert!((first.std_m - 5.0).abs() < 0.1, "half of what it can drive: {first:?}");
         for i in 0..20 {
-            model.observe(Some(&seen([3.0 * f64::from(i), -1.0 * f64::from(i)], 0.5)));
+            model.observe(Some(&seen([3.0 * f64::from(i), -f64::from(i)], 0.5)));
             model.predict(0.5);
         }
         let motion = model.predict(0.5);

@@ -102,8 +102,8 @@ pub fn update(
     let cells = joined.cells(&map.info)?;
 
     let is_held_back = |row: usize| match row.checked_sub(joined.of_map) {
-        None => row % HELD_BACK_OF_MAP == 0,
-        Some(of_drive) => of_drive % HELD_BACK_OF_DRIVE == 0,
+        None => row.is_multiple_of(HELD_BACK_OF_MAP),
+        Some(of_drive) => of_drive.is_multiple_of(HELD_BACK_OF_DRIVE),
     };
     let (tests, rest): (Vec<usize>, Vec<usize>) = (0..joined.positions_m.len()).partition(|&row| is_held_back(row));
     let known: Vec<usize> = rest.iter().copied().filter(|&row| row < joined.of_map).collect();

@@ -54,7 +54,7 @@ impl LensCheck {
             }
             self.added += usize::from(self.finder.as_mut().is_some_and(|finder| finder.add(image).is_ok()));
         }
-        let finder = self.finder.as_ref().filter(|_| self.added >= FRAMES && self.added % FRAMES == 0);
+        let finder = self.finder.as_ref().filter(|_| self.added >= FRAMES && self.added.is_multiple_of(FRAMES));
         let found = finder.map(DonutFinder::finish);
         match found {
             Some(Ok(donut)) if donut.verdict == Verdict::Sure => {
