@@ -56,7 +56,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     )?;
     print(&format!(
         "\nWhat this shows: a drive is recorded and synchronized, a map is learned from it, and on another day each single\n\
-         frame tells where it was taken, without GPS and without knowing where the vehicle was before.\n\n\
+         frame tells where it was taken, without GPS and without knowing where the vehicle was before. Filtered, as\n\
+         `omniloc localize` does it on the vehicle, a position comes with a covariance and a heading, and only when it is sure.\n\n\
          recordings {survey}   omniloc info {survey}\n\
          \x20          {other}\n\
          map        {map}   omniloc info {map}\n\

@@ -251,7 +251,8 @@ frames, so that, once measured on them (BE V), it learns from them too. m proper
 selection (m / kept). RMSE: all T with all features on the test frames; BE V and BE T with the features kept, on
 validation and test frames; e_max the largest test error. Right of the bar, the estimate the recipe stands for. skill:
 1 - RMSE / RMSE of always answering the median position; 1 is perfect, 0 knows nothing. Where features are chosen, BE V
-is of the frames they were chosen on: it flatters.
+is of the frames they were chosen on: it flatters. Rows of features are of single frames; `filtered` and `smoothed` take
+all features and the frames one after the other, filtered only those for which it says a position.
 ";
 
 #[cfg(test)]
