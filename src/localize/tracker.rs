@@ -33,8 +33,11 @@ const DOUBT_IN_CONTRADICTION: f64 = 0.5;
 /// A frame fits where the vehicle was expected if a cell within so many deviations, and at least so many steps, is likely.
 const FITTING_STDS: f64 = 3.0;
 const FITTING_STEPS: f64 = 3.0;
-/// Without a usable frame for so long, a position must be found anew \[s\].
+/// Without a usable frame for so long, and so many times as long as it usually takes, a position must be found anew \[s\].
 const BLIND_S: f64 = 1.5;
+const BLIND_INTERVALS: f64 = 3.0;
+/// Weight of an interval between frames in the usual one.
+const INTERVAL_WEIGHT: f64 = 0.1;
 /// Somewhere is expected if it is more likely than not.
 const EXPECTED: f64 = 0.5;
 /// The place of a frame is looked for by itself once the belief has so much of its probability in one hill.
@@ -54,6 +57,8 @@ pub struct Tracker {
     last_stamp_ns: Option<u64>,
     /// Of the last frame that was not skipped.
     last_used_ns: Option<u64>,
+    /// Between usable frames; `None` before the second \[s\].
+    usual_interval_s: Option<f64>,
     news: News,
     /// Variance that motions have added since pictures show how far the vehicle can have come \[m²\].
     wandered_m2: f64,
@@ -94,6 +99,7 @@ impl Tracker {
             states: StateMachine::new(map.info.least_resemblance),
             last_stamp_ns: None,
             last_used_ns: None,
+            usual_interval_s: None,
             news: News::new(&map.info),
             wandered_m2: 0.0,
             last_share: 1.0,
@@ -116,7 +122,7 @@ impl Tracker {
         let Worth { share, reach } = self.news.of(frame.stamp_ns, frame.features);
         self.advance(frame.stamp_ns, reach);
         let expected = self.belief.mode();
-        self.last_used_ns = Some(frame.stamp_ns);
+        self.note_interval(frame.stamp_ns);
         self.last_share = share;
         self.belief.weigh(frame.log_likelihood, (share / self.temperature) as f32);
         let mode = self.belief.mode();
@@ -161,8 +167,18 @@ impl Tracker {
         }
         self.belief.doubt(self.doubt);
         self.doubt = 0.0;
-        if self.last_used_ns.is_some_and(|last| seconds(last, stamp_ns) > BLIND_S) {
+        let interval_s = self.last_used_ns.map(|last| seconds(last, stamp_ns));
+        let longest_s = self.usual_interval_s.map(|usual_s| BLIND_S.max(BLIND_INTERVALS * usual_s));
+        if interval_s.zip(longest_s).is_some_and(|(interval_s, longest_s)| interval_s > longest_s) {
             self.states.lose();
+        }
+    }
+
+    /// A usable frame has come.
+    fn note_interval(&mut self, stamp_ns: u64) {
+        if let Some(interval_s) = self.last_used_ns.replace(stamp_ns).map(|last| seconds(last, stamp_ns)) {
+            let usual_s = self.usual_interval_s.unwrap_or(interval_s);
+            self.usual_interval_s = Some(usual_s + INTERVAL_WEIGHT * (interval_s - usual_s));
         }
     }
 
@@ -226,5 +242,87 @@ impl Tracker {
     /// The heading of a panorama with this signature at about `position_m`, if the map has a compass.
     pub fn heading(&self, position_m: PositionM, signature: &[i8]) -> Option<EstimatedHeading> {
         self.compass.as_ref()?.heading(signature, position_m)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use LocalizationState::{Candidate, Localized, Lost};
+
+    use super::*;
+    use crate::map::tests::small_map;
+
+    /// A map of 40 x 40 m; frames say where they are with 0.7 m on either axis.
+    struct Drive {
+        tracker: Tracker,
+        cells: CandidateCells,
+        temperature: f64,
+        frames: u32,
+    }
+
+    impl Drive {
+        fn new() -> Self {
+            let small = small_map();
+            let cells = CandidateCells::around(&[[0.0, 0.0], [40.0, 40.0]], 1.0, None).expect("a small grid");
+            let temperature = small.info.temperature;
+            let map = FeatureMap { cells: cells.clone(), ..small };
+            Self { tracker: Tracker::new(&map, MotionSettings::default()), cells, temperature, frames: 0 }
+        }
+
+        fn see(&mut self, time_s: f64, at_m: PositionM) -> PositionEstimate {
+            let log = |c: &PositionM| -0.5 * self.temperature * distance_m(*c, at_m).powi(2) / 0.7_f64.powi(2);
+            let log_likelihood: Vec<f32> = self.cells.centers_m().iter().map(|c| log(c) as f32).collect();
+            self.frames += 1;
+            // Every view differs from the one before.
+            let features = [9.0 * (self.frames % 2) as f32, self.frames as f32];
+            let stamp_ns = stamp_ns(time_s);
+            let frame = Observation {
+                sequence: self.frames,
+                stamp_ns,
+                log_likelihood: &log_likelihood,
+                nowhere: Some(-100.0),
+                features: &features,
+                compass: &[],
+            };
+            self.tracker.take(&frame).estimate
+        }
+    }
+
+    fn stamp_ns(time_s: f64) -> u64 {
+        (time_s * NS_PER_S as f64) as u64
+    }
+
+    #[test]
+    fn a_vehicle_is_followed_however_seldom_it_is_seen() {
+        for interval_s in [0.1, 1.0, 5.0] {
+            let mut drive = Drive::new();
+            let estimates: Vec<PositionEstimate> =
+                (0..12).map(|i| drive.see(interval_s * f64::from(i), [10.0 + 0.5 * f64::from(i), 20.0])).collect();
+            assert!(estimates[..2].iter().all(|estimate| estimate.state == Candidate && estimate.pose.is_none()));
+            let last = estimates[11].pose.unwrap_or_else(|| panic!("{interval_s} s: {:?}", estimates[11]));
+            assert!(distance_m(last.position_m, [15.5, 20.0]) < 0.7, "{interval_s} s: {last:?}");
+        }
+    }
+
+    #[test]
+    fn a_jump_is_not_followed_at_once() {
+        let mut drive = Drive::new();
+        (0..6).for_each(|i| _ = drive.see(f64::from(i), [10.0, 10.0 + f64::from(i)]));
+        let jumped = drive.see(6.0, [35.0, 35.0]);
+        assert_eq!((jumped.state, jumped.pose), (Lost, None), "{jumped:?}");
+        assert!(jumped.warnings.contradiction);
+        let states: Vec<LocalizationState> = (7..12).map(|i| drive.see(f64::from(i), [35.0, 35.0]).state).collect();
+        assert!(states[0] != Localized && states[4] == Localized, "{states:?}");
+    }
+
+    #[test]
+    fn frames_that_cannot_be_used_are_bridged_for_a_while() {
+        let mut drive = Drive::new();
+        (0..8).for_each(|i| _ = drive.see(0.2 * f64::from(i), [10.0 + f64::from(i), 20.0]));
+        let bridged = drive.tracker.skip(8, stamp_ns(1.6));
+        let pose = bridged.pose.expect("it was seen a moment ago");
+        assert!(distance_m(pose.position_m, [18.0, 20.0]) < 1.0 && bridged.warnings.bad_frame, "{bridged:?}");
+        assert_eq!(drive.tracker.skip(9, stamp_ns(4.0)).state, Lost);
+        assert_eq!(drive.see(4.2, [31.0, 20.0]).state, Candidate);
     }
 }
