@@ -28,14 +28,14 @@ fn drive(folder: &Path) -> PathBuf {
     finished(folder).first().unwrap_or_else(|| panic!("{}", stderr(&output))).clone()
 }
 
+fn replaying(recording: &Path, extra: &[&str]) -> Command {
+    let mut command = Command::new(omniloc_path());
+    command.args(["replay", "--mode", "localize", "--map"]).arg(map()).arg(recording).args(extra);
+    command
+}
+
 fn replay(recording: &Path, extra: &[&str]) -> Output {
-    Command::new(omniloc_path())
-        .args(["replay", "--mode", "localize", "--map"])
-        .arg(map())
-        .arg(recording)
-        .args(extra)
-        .output()
-        .expect("runs")
+    replaying(recording, extra).output().expect("runs")
 }
 
 fn lines(output: &Output) -> Vec<Value> {
@@ -68,6 +68,16 @@ fn a_replay_says_where_the_vehicle_was_and_the_same_every_time() {
     let recorded_bytes = fs::read(&out).expect("readable");
     let again = replay(&recording, &["--force", "--out", &out.to_string_lossy()]);
     assert_eq!(again.stdout, first.stdout);
+    assert_eq!(fs::read(&out).expect("readable"), recorded_bytes);
+
+    // Nobody reads: without a file there is nothing left to do, with one it is written all the same.
+    let unread = |extra: &[&str]| {
+        let mut child = replaying(&recording, extra).stdout(Stdio::piped()).spawn().expect("starts");
+        drop(child.stdout.take());
+        assert!(child.wait().expect("ends").success());
+    };
+    unread(&[]);
+    unread(&["--force", "--out", &out.to_string_lossy()]);
     assert_eq!(fs::read(&out).expect("readable"), recorded_bytes);
 }
 

@@ -163,13 +163,18 @@ fn localize_as_fast_as_it_goes(
         json_lines::write_line(&TimedEstimate { estimate: *estimate, utc_ns }, map_frame.as_ref(), &mut line);
         stdout.write_all(&line)
     };
+    let has_gone = |error: &std::io::Error| error.kind() == std::io::ErrorKind::BrokenPipe;
     let play = |session: &mut Session, each: &mut dyn FnMut(&PositionEstimate) -> std::io::Result<()>| {
         let records = DeviceRecords::open(&args.recording)?;
         playback_localize::play(records, session, each)
             .with_context(|| format!("replaying {}", args.recording.display()))
     };
     match &args.out {
-        None => play(&mut session, &mut each)?,
+        None => match play(&mut session, &mut each) {
+            // Whoever reads has seen enough.
+            Err(error) if error.chain().any(|cause| cause.downcast_ref().is_some_and(has_gone)) => {}
+            outcome => outcome?,
+        },
         Some(out) => {
             let head = drive::localize_head(recording, config);
             let first_ns = drive::first_clocks(&args.recording)?.monotonic_ns;
@@ -182,7 +187,7 @@ fn localize_as_fast_as_it_goes(
                     let (message, pose) = encoder.estimate(estimate);
                     to_file.push(message);
                     pose.into_iter().for_each(|pose| _ = to_file.push(pose));
-                    each(estimate)
+                    each(estimate).or_else(|error| if has_gone(&error) { Ok(()) } else { Err(error) })
                 })?;
                 if let Some(error) = to_file.error {
                     return Err(failed(error).into());
@@ -192,9 +197,8 @@ fn localize_as_fast_as_it_goes(
             })?;
         }
     }
-    // Whoever reads may have seen enough.
     match stdout.flush() {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => return Err(error.into()),
+        Err(error) if !has_gone(&error) => return Err(error.into()),
         _ => {}
     }
     let status = LocalizeStatus {
