@@ -7,12 +7,14 @@ use crate::{
     devices::{CameraEvent, CameraFrame},
     localize::{Localizer, MotionSettings, Timings},
     map::FeatureMap,
-    types::{EstimateWarnings, LocalizationState, PositionEstimate},
+    types::{DonutCalibration, EstimateWarnings, LocalizationState, PositionEstimate},
 };
 
 /// Localizes on one map, and keeps count.
 pub struct Session {
     localizer: Localizer,
+    /// Where the localizer takes the donut to be.
+    calibration: DonutCalibration,
     lens_check: Option<LensCheck>,
     map: FeatureMap,
     settings: MotionSettings,
@@ -45,6 +47,7 @@ impl Session {
     pub fn new(map: FeatureMap, settings: MotionSettings) -> Result<Self, LensError> {
         Ok(Self {
             localizer: Localizer::new(&map, &map.info.calibration, settings)?,
+            calibration: map.info.calibration.clone(),
             lens_check: Some(LensCheck::new(&map.info.calibration)),
             map,
             settings,
@@ -98,15 +101,24 @@ impl Session {
         let Some(verdict) = self.lens_check.as_mut().and_then(|check| check.look(jpeg)) else { return Ok(()) };
         self.lens_check = None;
         match verdict {
-            LensVerdict::Fits => {}
+            LensVerdict::Fits => self.look_through(self.map.info.calibration.clone()),
             LensVerdict::Slipped { by_px: [x_px, y_px], calibration } => {
                 warn!(x_px, y_px, "the lens has slipped since the survey: the panorama is cut out where it is now");
-                self.localizer = Localizer::new(&self.map, &calibration, self.settings)?;
+                self.look_through(calibration)
             }
             LensVerdict::Unclear(reason) => {
-                warn!(reason, "the lens could not be checked; going on with the map's calibration");
+                warn!(reason, "the lens could not be checked; going on as before");
+                Ok(())
             }
-            LensVerdict::Other(what) => return Err(LensError::Other { what }),
+            LensVerdict::Other(what) => Err(LensError::Other { what }),
+        }
+    }
+
+    /// Goes on with the donut where it is; from the beginning if that is elsewhere than before.
+    fn look_through(&mut self, calibration: DonutCalibration) -> Result<(), LensError> {
+        if calibration != self.calibration {
+            self.localizer = Localizer::new(&self.map, &calibration, self.settings)?;
+            self.calibration = calibration;
         }
         Ok(())
     }
