@@ -98,7 +98,8 @@ mod tests {
         let mut properties = vec![0.0; DIMENSIONS];
         axis.magnitudes(row_sums, 1.0, &mut properties[..HARMONICS]);
         axis.magnitudes(column_sums, 1.0, &mut properties[HARMONICS..]);
-        assert_close("fft128", &properties, &list(&golden()["fft128"]), 1e-6);
+        // Numbers up to 10 000 are transformed in f32; the least magnitude is 300.
+        assert_close("fft128", &properties, &list(&golden()["fft128"]), 4e-6);
     }
 
     #[test]
