@@ -4,6 +4,7 @@
 //! scaling that turns properties into features, the learning features with the hyperparameters of their Gaussian
 //! processes, and the posterior of every feature on the candidate cells, which is all that matching a frame reads.
 
+mod blocks;
 mod cells;
 mod compass;
 pub mod file;
@@ -13,9 +14,10 @@ mod track;
 use faer::Mat;
 use serde::{Deserialize, Serialize};
 
+pub use blocks::{BLOCK_SIDE, Block};
 pub use cells::{CandidateCells, CellsError, Grid};
 pub use compass::Compass;
-pub use file::{FORMAT_VERSION, MapError};
+pub use file::{FORMAT_VERSION, GroupField, MapError, OpenMap};
 pub use recipe::{
     GroupHyperparameters, GroupRecipe, Model, NoiseModel, NoiseWhiteningSettings, PERTURBED_COPIES, Recipe, RecipeName,
     Selection, SplitKind,
