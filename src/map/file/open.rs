@@ -1,5 +1,7 @@
 //! A map's way out of a file: what it says of the whole at once, the rest when it is asked for.
 
+use std::ops::Range;
+
 use faer::Mat;
 
 use super::tensors::{Number, ReadAt, TensorFile, numbers};
@@ -101,6 +103,11 @@ impl OpenMap {
         self.fields.ends.last().copied().unwrap_or(0)
     }
 
+    /// Number of bytes of the fields of a block.
+    pub fn block_bytes(&self, block: usize) -> usize {
+        self.fields.range(block).len()
+    }
+
     /// Every group's field on the cells of a block.
     ///
     /// # Errors
@@ -143,11 +150,6 @@ impl OpenMap {
             }
         }
         Ok(all)
-    }
-
-    /// Number of bytes of the signatures.
-    pub fn compass_bytes(&self) -> usize {
-        self.compass.as_ref().map_or(0, |(_, signatures)| signatures.sums.len() * COMPASS_BYTES)
     }
 
     /// The compass, of the learning panoramas whose positions are wanted; `None` if the map has none.
@@ -237,10 +239,13 @@ impl Parts {
         Ok(Self { ends, sums })
     }
 
+    fn range(&self, part: usize) -> Range<usize> {
+        part.checked_sub(1).map_or(0, |before| self.ends[before])..self.ends[part]
+    }
+
     /// The bytes of a part, checked.
     fn read(&self, file: &TensorFile, name: &str, part: usize) -> Result<Vec<u8>, MapError> {
-        let from = part.checked_sub(1).map_or(0, |before| self.ends[before]);
-        let bytes = file.bytes_in(name, from..self.ends[part])?;
+        let bytes = file.bytes_in(name, self.range(part))?;
         if !cfg!(fuzzing) && crc32fast::hash(&bytes) != self.sums[part] {
             return Err(MapError::Damaged(format!("part {part} of {name} does not fit its checksum")));
         }
