@@ -12,7 +12,7 @@ use super::likelihood::MapFields;
 use super::motion::MotionSettings;
 use super::tracker::Tracker;
 use crate::map::{BLOCK_SIDE, CandidateCells, MapError, OpenMap};
-use crate::types::{LocalizationState, distance_m};
+use crate::types::{LocalizationState, PositionM, distance_m};
 
 /// A window has room for so many steps of the grid around the position, at least.
 const NEAR_STEPS: f64 = 12.0;
@@ -22,7 +22,7 @@ const NEAR_STDS: f64 = 4.0;
 const LASTING_STEPS: f64 = 16.0;
 /// The vehicle gets faster by at most so many deviations of what the settings say.
 const ACCELERATION_STDS: f64 = 3.0;
-/// A position that needs a wider window is looked for everywhere \[steps\].
+/// A position that needs a wider window is looked for everywhere; and headings are taken from so far \[steps\].
 const WIDEST_STEPS: f64 = 64.0;
 
 pub struct LargeMap {
@@ -37,6 +37,8 @@ pub struct LargeMap {
     uses: u64,
     /// `None`: everywhere.
     window: Option<Window>,
+    /// What the present headings are taken from lies about here.
+    compass_m: Option<PositionM>,
     /// So many frames more until everything may be searched because of a strange frame.
     spared: usize,
     /// Of one block.
@@ -77,6 +79,7 @@ impl LargeMap {
             loaded_bytes: 0,
             uses: 0,
             window: None,
+            compass_m: None,
             spared: 0,
             of_block: Vec::new(),
         }
@@ -115,13 +118,10 @@ impl LargeMap {
     fn choose_window(&mut self, frame: &Features, tracker: &mut Tracker) -> Result<(), MapError> {
         let grid = self.map.cells.grid;
         let hill = tracker.hill();
+        self.turn_near(&hill, tracker)?;
         let can_tell_strange_frames = frame.nowhere.is_some() && self.map.info.least_resemblance.is_some();
         if tracker.state() != LocalizationState::Localized || !can_tell_strange_frames {
             self.look_everywhere(tracker);
-            // The next position may be said with its heading.
-            if tracker.state() == LocalizationState::Candidate {
-                self.turn_near(&hill, tracker)?;
-            }
             return Ok(());
         }
         let std_m = hill.covariance.ee_m2.max(hill.covariance.nn_m2).sqrt();
@@ -145,13 +145,18 @@ impl LargeMap {
         let window = Window::new(&self.map, whole_blocks(columns, grid.columns), whole_blocks(rows, grid.rows));
         tracker.look_at(&window.cells);
         self.window = Some(window);
-        self.turn_near(&hill, tracker)
+        Ok(())
     }
 
-    /// Headings are taken from the panoramas about a position.
-    fn turn_near(&self, hill: &Mode, tracker: &mut Tracker) -> Result<(), MapError> {
-        let reach_m = WIDEST_STEPS * self.map.cells.grid.step_m;
-        tracker.turn_by(self.map.compass(|position_m| distance_m(position_m, hill.mean_m) < reach_m)?);
+    /// Has headings taken from the panoramas about where the vehicle seems to be, whether that may be said yet or not.
+    fn turn_near(&mut self, hill: &Mode, tracker: &mut Tracker) -> Result<(), MapError> {
+        let (at_m, step_m) = (hill.mean_m, self.map.cells.grid.step_m);
+        let is_near = |compass_m| distance_m(compass_m, at_m) < LASTING_STEPS * step_m;
+        if tracker.state() == LocalizationState::Unknown || self.compass_m.is_some_and(is_near) {
+            return Ok(());
+        }
+        tracker.turn_by(self.map.compass(|position_m| distance_m(position_m, at_m) < WIDEST_STEPS * step_m)?);
+        self.compass_m = Some(at_m);
         Ok(())
     }
 

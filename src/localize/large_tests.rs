@@ -3,8 +3,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::features::COMPASS_BYTES;
 use crate::localize::{Observation, Tracked};
-use crate::map::{FeatureMap, NoiseModel, file, tests::small_map};
+use crate::map::{Compass, FeatureMap, NoiseModel, file, tests::small_map};
 use crate::types::{NS_PER_S, PositionM};
 
 const FEATURES: usize = 24;
@@ -35,16 +36,32 @@ impl Road {
         group.field_mean = waves.iter().flat_map(on_cells).collect();
         group.field_variance = vec![1.0; cells.len()];
         group.scaling.projection = Mat::zeros(FEATURES, info.recipe.descriptor.dimensions());
-        group.learning = Mat::zeros(map.positions_m.len(), FEATURES);
+        group.learning = Mat::zeros(road.len(), FEATURES);
         (info.features, info.rank, info.recipe.noise) = (FEATURES, FEATURES, NoiseModel::UnknownScale);
         (map.info.temperature, map.info.least_resemblance) = (1.0, Some(20.0));
         (map.info.grid, map.cells) = (cells.grid, cells);
+        map.compass = Some(Compass {
+            yaws_rad: (0..road.len()).map(|i| 0.01 * i as f64).collect(),
+            signatures: (0..road.len() * COMPASS_BYTES).map(|_| random.random::<i8>() / 2).collect(),
+            positions_m: road.clone(),
+            sense: 1.0,
+            std_rad: map.info.heading_std_rad.expect("has a compass"),
+        });
+        map.positions_m = road;
         Self { map, waves }
     }
 
     fn open(&self) -> OpenMap {
         OpenMap::open(Box::new(file::to_bytes(&self.map))).expect("sound")
     }
+}
+
+/// Every learning panorama looks quite different.
+fn signature(road: &Road, at_m: PositionM) -> &[i8] {
+    let compass = road.map.compass.as_ref().expect("has one");
+    let away_m = |i: &usize| distance_m(compass.positions_m[*i], at_m);
+    let nearest = (0..compass.positions_m.len()).min_by(|a, b| away_m(a).total_cmp(&away_m(b)));
+    compass.signature(nearest.expect("there are some"))
 }
 
 /// What a feature is at a position, in deviations of the noise.
@@ -54,19 +71,19 @@ fn look(wave: &[f64; 3], at_m: PositionM) -> f64 {
 
 /// Ten frames a second, with some noise.
 struct Camera<'a> {
-    waves: &'a [[f64; 3]],
+    road: &'a Road,
     random: ChaCha8Rng,
     frames: u32,
 }
 
 impl<'a> Camera<'a> {
     fn new(road: &'a Road) -> Self {
-        Self { waves: &road.waves, random: ChaCha8Rng::seed_from_u64(5), frames: 0 }
+        Self { road, random: ChaCha8Rng::seed_from_u64(5), frames: 0 }
     }
 
     fn features(&mut self, at_m: PositionM) -> (u32, u64, Vec<f32>) {
         let mut noise = || 12.0_f64.sqrt() * (self.random.random::<f64>() - 0.5);
-        let features = self.waves.iter().map(|wave| (look(wave, at_m) + noise()) as f32).collect();
+        let features = self.road.waves.iter().map(|wave| (look(wave, at_m) + noise()) as f32).collect();
         self.frames += 1;
         (self.frames, u64::from(self.frames) * NS_PER_S / 10, features)
     }
@@ -94,7 +111,8 @@ impl<'a> Follower<'a> {
         let frame = Features { stamp_ns, features: &features, nowhere };
         self.large.match_frame(&frame, &mut self.tracker, &mut Vec::new(), &mut self.log_likelihood)?;
         let (log_likelihood, features) = (&self.log_likelihood[..], &features[..]);
-        let frame = Observation { sequence, stamp_ns, log_likelihood, nowhere, features, compass: &[] };
+        let compass = signature(self.camera.road, at_m);
+        let frame = Observation { sequence, stamp_ns, log_likelihood, nowhere, features, compass };
         Ok(self.tracker.take(&frame))
     }
 
@@ -118,13 +136,15 @@ fn a_window_follows_the_vehicle_as_the_whole_map_does() {
         fields.add_log_likelihood(&features, &mut Vec::new(), &mut log_likelihood);
         let nowhere = MapFields::log_likelihood_nowhere(&road.map.info.groups, &features);
         let (log_likelihood, features) = (&log_likelihood[..], &features[..]);
-        let frame = Observation { sequence, stamp_ns, log_likelihood, nowhere, features, compass: &[] };
+        let compass = signature(&road, at_m);
+        let frame = Observation { sequence, stamp_ns, log_likelihood, nowhere, features, compass };
         let expected = tracker.take(&frame).estimate;
 
         assert_eq!(found.state, expected.state, "{i}");
         if let Some((found, expected)) = found.pose.zip(expected.pose) {
             assert!(distance_m(found.position_m, expected.position_m) < 0.02, "{i}: {found:?} {expected:?}");
             assert!(distance_m(found.position_m, at_m) < 1.0, "{i}: {found:?} {at_m:?}");
+            assert_eq!(found.heading, expected.heading, "{i}");
             let ratio = found.covariance.ee_m2 / expected.covariance.ee_m2;
             assert!((ratio - 1.0).abs() < 0.05, "{i}: {ratio}");
             windows.extend((!follower.searched_everywhere()).then_some(follower.log_likelihood.len()));
