@@ -2,6 +2,7 @@
 
 use std::f64::consts::TAU;
 
+use libm::hypot;
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
 use super::evidence::Maps;
@@ -83,7 +84,7 @@ pub(super) fn fit(maps: &Maps, mean_weight: f32, start: Circles, start_error_px:
     for round in 1..ROUNDS {
         circles = robust_fit(&found, circles)?.circles;
         let progress = (round as f64 / (ROUNDS - 2) as f64).min(1.0);
-        found = finder.rim_points(&circles, first_window * (last_window / first_window).powf(progress));
+        found = finder.rim_points(&circles, first_window * libm::pow(last_window / first_window, progress));
     }
     let solution = robust_fit(&found, circles)?;
     let circles = solution.circles;
@@ -124,7 +125,7 @@ impl EdgeFinder<'_> {
         for (rim, radius_px) in [(Rim::Inner, circles.inner_radius_px), (Rim::Outer, circles.outer_radius_px)] {
             let window_px = window_px.min(0.5 * radius_px).min(0.4 * gap_px);
             for ray in 0..RAYS {
-                let (sin, cos) = (ray as f64 / RAYS as f64 * TAU).sin_cos();
+                let (sin, cos) = libm::sincos(ray as f64 / RAYS as f64 * TAU);
                 let Some(profile) = self.profile(circles.center_px, [cos, sin], radius_px, window_px) else {
                     continue;
                 };
@@ -182,8 +183,8 @@ impl EdgeFinder<'_> {
             })
             .collect();
         let middle = (gradients.len() / 2) as f64;
-        let prior = |i: usize| (-0.5 * ((i as f64 - middle) / middle * PRIOR_DEVIATIONS).powi(2)).exp() as f32;
-        let both = |i: usize| (self.mean_weight * gradients[i][0]).hypot(gradients[i][1]);
+        let prior = |i: usize| libm::exp(-0.5 * ((i as f64 - middle) / middle * PRIOR_DEVIATIONS).powi(2)) as f32;
+        let both = |i: usize| libm::hypotf(self.mean_weight * gradients[i][0], gradients[i][1]);
         let inside = 1..gradients.len().saturating_sub(1);
         let peak = inside
             .clone()
@@ -206,7 +207,7 @@ impl EdgeFinder<'_> {
 
 /// Distance from the point's circle, positive outside \[px\].
 fn residual_px(point: &RimPoint, circles: &Circles) -> f64 {
-    let distance = (point.at_px[0] - circles.center_px[0]).hypot(point.at_px[1] - circles.center_px[1]);
+    let distance = hypot(point.at_px[0] - circles.center_px[0], point.at_px[1] - circles.center_px[1]);
     distance - if point.rim == Rim::Inner { circles.inner_radius_px } else { circles.outer_radius_px }
 }
 
@@ -251,7 +252,7 @@ fn robust_fit(found: &RimPoints, start: Circles) -> Option<Solution> {
         for (point, &e) in points.iter().zip(&residuals) {
             let w = biweight(e, deviation);
             let (dx, dy) = (point.at_px[0] - circles.center_px[0], point.at_px[1] - circles.center_px[1]);
-            let distance = dx.hypot(dy).max(1e-9);
+            let distance = hypot(dx, dy).max(1e-9);
             let is_inner = if point.rim == Rim::Inner { 1.0 } else { 0.0 };
             let row = Vector4::new(-dx / distance, -dy / distance, -is_inner, is_inner - 1.0);
             normal += w * row * row.transpose();
@@ -310,7 +311,7 @@ fn center_disagreement_px(points: &[RimPoint], circles: &Circles) -> Option<f64>
         for (point, e) in of_rim {
             let w = biweight(e, deviation);
             let (dx, dy) = (point.at_px[0] - circles.center_px[0], point.at_px[1] - circles.center_px[1]);
-            let distance = dx.hypot(dy).max(1e-9);
+            let distance = hypot(dx, dy).max(1e-9);
             let row = Vector3::new(dx / distance, dy / distance, 1.0);
             normal += w * row * row.transpose();
             right += w * e * row;
@@ -318,5 +319,5 @@ fn center_disagreement_px(points: &[RimPoint], circles: &Circles) -> Option<f64>
         normal.cholesky().map(|cholesky| cholesky.solve(&right))
     });
     let (inner, outer) = (inner?, outer?);
-    Some((inner[0] - outer[0]).hypot(inner[1] - outer[1]))
+    Some(hypot(inner[0] - outer[0], inner[1] - outer[1]))
 }

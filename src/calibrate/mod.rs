@@ -12,6 +12,9 @@
 //! The *rim* is where image content changes to surround or hub: the middle of that edge. Pixel centres are at integer
 //! coordinates, as in [`DonutCalibration`](crate::types::DonutCalibration).
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod evidence;
 mod fit;
 mod judge;
@@ -155,8 +158,8 @@ impl DonutFinder {
         let wander_px = self.wander.deviation_px();
         let of_mean_px = wander_px.unwrap_or(0.0) / f64::from(self.evidence.frames).sqrt();
         // Shaking moves the centre, not the radii.
-        fit.deviations_px[0] = fit.deviations_px[0].hypot(of_mean_px);
-        fit.deviations_px[1] = fit.deviations_px[1].hypot(of_mean_px);
+        fit.deviations_px[0] = libm::hypot(fit.deviations_px[0], of_mean_px);
+        fit.deviations_px[1] = libm::hypot(fit.deviations_px[1], of_mean_px);
         let mut estimate = judge::judge(&candidate, &fit, self.evidence.frames)?;
         estimate.wander_px = wander_px;
         Ok(estimate)

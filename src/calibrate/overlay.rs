@@ -72,12 +72,12 @@ fn legend(donut: &DonutEstimate) -> Vec<(String, [u8; 3])> {
 fn draw_marks(picture: &mut RgbImage, height_px: usize, donut: &DonutEstimate, orientation: &Orientation) {
     let (inner, outer) = (donut.inner_radius_px, donut.outer_radius_px);
     let sense = if orientation.clockwise { 1.0 } else { -1.0 };
-    let (sin, cos) = (sense * orientation.start_angle_rad).sin_cos();
+    let (sin, cos) = libm::sincos(sense * orientation.start_angle_rad);
     let cover = |distance_px: f64| (HALF_LINE_PX + 0.5 - distance_px).clamp(0.0, 1.0);
     for y in 0..height_px {
         for x in 0..picture.width() as usize {
             let (dx, dy) = (x as f64 - donut.center_x_px, y as f64 - donut.center_y_px);
-            let r = dx.hypot(dy);
+            let r = libm::hypot(dx, dy);
             // Along the start ray and across it, in the direction of the columns.
             let (along, across) = (dx * cos + dy * sin, sense * (dy * cos - dx * sin));
             let on_ray = along > inner && along < outer;

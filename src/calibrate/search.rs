@@ -171,8 +171,10 @@ impl Level {
                 ];
             }
         }
-        let directions =
-            (0..DIRECTIONS).map(|i| (i as f32 + 0.5) / DIRECTIONS as f32 * TAU).map(|a| [a.cos(), a.sin()]).collect();
+        let directions = (0..DIRECTIONS)
+            .map(|i| (i as f32 + 0.5) / DIRECTIONS as f32 * TAU)
+            .map(|a| [libm::cosf(a), libm::sinf(a)])
+            .collect();
         let gradient_scale = (3.0 * mean_weight * reduced.noise()).max(MIN_GRADIENT * mean_weight.max(0.5));
         // A circle of this radius about the centre of a square image shows MIN_VISIBLE_SHARE of itself.
         let max_radius = (0.65 * width.min(height) as f32) as usize;

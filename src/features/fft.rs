@@ -77,7 +77,7 @@ impl Axis {
             .process_with_scratch(&mut self.input, &mut self.spectrum, &mut self.scratch)
             .expect("the buffers come from the plan");
         for (magnitude, harmonic) in magnitudes.iter_mut().zip(&self.spectrum[1..]) {
-            *magnitude = (scale * harmonic.norm()) as f32;
+            *magnitude = (scale * harmonic.norm_sqr().sqrt()) as f32;
         }
     }
 }

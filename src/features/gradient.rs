@@ -153,7 +153,7 @@ impl GradientSignature {
     /// The signature of the panorama last looked at.
     pub fn describe(&self, sign: Sign, properties: &mut [f32]) {
         let scale = 1.0 / self.columns as f32;
-        let magnitude = |harmonic: Complex<f32>| (scale * harmonic.norm()).sqrt();
+        let magnitude = |harmonic: Complex<f32>| (scale * harmonic.norm_sqr().sqrt()).sqrt();
         match sign {
             Sign::Signed => {
                 for (property, &harmonic) in properties.iter_mut().zip(&self.harmonics) {
@@ -175,9 +175,9 @@ impl GradientSignature {
     /// The compass signature of the panorama last looked at: bin × band × harmonic × (real, imaginary part). Magnitudes are
     /// their square roots, which makes the peak of a correlation sharp, and scaled to ±127.
     pub fn compass(&self, signature: &mut [i8]) {
-        let greatest = self.compass.iter().map(|harmonic| harmonic.norm()).fold(f32::MIN_POSITIVE, f32::max);
+        let greatest = self.compass.iter().map(|harmonic| harmonic.norm_sqr().sqrt()).fold(f32::MIN_POSITIVE, f32::max);
         for (parts, harmonic) in signature.chunks_exact_mut(2).zip(&self.compass) {
-            let scale = COMPASS_GREATEST / (harmonic.norm() * greatest).sqrt().max(f32::MIN_POSITIVE);
+            let scale = COMPASS_GREATEST / (harmonic.norm_sqr().sqrt() * greatest).sqrt().max(f32::MIN_POSITIVE);
             parts[0] = (harmonic.re * scale).round() as i8;
             parts[1] = (harmonic.im * scale).round() as i8;
         }
@@ -194,7 +194,7 @@ impl GradientSignature {
                     *sum += group.iter().sum::<f32>();
                 }
             }
-            reduced.iter_mut().for_each(|sum| *sum = (*sum / area + DARK_LEVEL).ln());
+            reduced.iter_mut().for_each(|sum| *sum = libm::logf(*sum / area + DARK_LEVEL));
         }
     }
 
@@ -264,7 +264,7 @@ impl GradientSignature {
 /// Half of a symmetric Gaussian kernel, centre first, cut off at 3 σ; its sum over both halves is 1.
 fn gaussian_kernel(sigma: f32) -> Vec<f32> {
     let radius = (3.0 * sigma).ceil() as i32;
-    let mut half: Vec<f32> = (0..=radius).map(|i| (-0.5 * (i as f32 / sigma).powi(2)).exp()).collect();
+    let mut half: Vec<f32> = (0..=radius).map(|i| libm::expf(-0.5 * (i as f32 / sigma).powi(2))).collect();
     let sum = 2.0 * half.iter().sum::<f32>() - half[0];
     half.iter_mut().for_each(|weight| *weight /= sum);
     half

@@ -3,6 +3,9 @@
 //! A *descriptor* is the vector of image properties y of one panorama; a *feature* is one entry of it after scaling
 //! (whitening or z-score).
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod fft;
 mod gradient;
 mod histogram;

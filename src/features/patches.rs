@@ -65,13 +65,13 @@ impl Patches {
     pub fn new() -> Self {
         let cosine = |order: usize, i: usize| {
             let norm = (if order == 0 { 1.0 } else { 2.0 } / SIDE as f32).sqrt();
-            norm * (PI * (i as f32 + 0.5) * order as f32 / SIDE as f32).cos()
+            norm * libm::cosf(PI * (i as f32 + 0.5) * order as f32 / SIDE as f32)
         };
         let wave = |w: usize, b: usize| {
             let angle = TAU * (w.div_ceil(2) * b) as f32 / BINS as f32;
             match w {
                 0 => (1.0 / BINS as f32).sqrt(),
-                _ => (2.0 / BINS as f32).sqrt() * if w % 2 == 1 { angle.cos() } else { angle.sin() },
+                _ => (2.0 / BINS as f32).sqrt() * if w % 2 == 1 { libm::cosf(angle) } else { libm::sinf(angle) },
             }
         };
         let orders: Vec<[usize; 3]> = (0..=MAX_ORDER)
@@ -255,8 +255,8 @@ impl SplitMix {
     }
 
     fn normal(&mut self) -> f64 {
-        let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
-        radius * (std::f64::consts::TAU * self.uniform()).cos()
+        let radius = (-2.0 * libm::log(1.0 - self.uniform())).sqrt();
+        radius * libm::cos(std::f64::consts::TAU * self.uniform())
     }
 }
 

@@ -104,7 +104,7 @@ impl<T: FftNum + Into<f64>> SteerablePyramid<T> {
             }
         }
         if response == Response::LogMagnitude {
-            properties.iter_mut().for_each(|mean| *mean = (mean.max(0.0) + 1e-3).ln());
+            properties.iter_mut().for_each(|mean| *mean = libm::logf(mean.max(0.0) + 1e-3));
         }
     }
 }
@@ -238,7 +238,7 @@ fn convert<T: FftNum>(value: f64) -> T {
 
 /// H of the type's documentation.
 fn high_pass(r: f64) -> f64 {
-    (FRAC_PI_2 * (-r.log2()).clamp(0.0, 1.0)).cos()
+    libm::cos(FRAC_PI_2 * (-libm::log2(r)).clamp(0.0, 1.0))
 }
 
 fn low_pass(r: f64) -> f64 {
@@ -256,15 +256,15 @@ fn band_filter<T: FftNum>(scale: usize, orientation: usize, size: usize) -> Vec<
     for u in 0..size {
         for v in 0..size {
             let (x, y) = (signed(u) / nyquist, signed(v) / nyquist);
-            let r = x.hypot(y);
+            let r = libm::hypot(x, y);
             let radial = if r == 0.0 {
                 0.0
             } else {
                 (0..=scale).map(|s| low_pass(r * f64::from(1 << s))).product::<f64>()
                     * high_pass(r * f64::from(1 << (scale + 1)))
             };
-            let angle = y.atan2(x) - PI * orientation as f64 / ORIENTATIONS as f64;
-            filter.push(convert(radial * gain * angle.cos().powi(order)));
+            let angle = libm::atan2(y, x) - PI * orientation as f64 / ORIENTATIONS as f64;
+            filter.push(convert(radial * gain * libm::cos(angle).powi(order)));
         }
     }
     filter

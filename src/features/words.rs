@@ -62,7 +62,7 @@ impl PatchWords {
             let (distances, nearest) = distances(patch, &self.words, &self.half_squares);
             self.shares.clear();
             let near = |&(_, distance): &(usize, &f32)| *distance < nearest + 0.5 * NEGLIGIBLE / SHARPNESS;
-            let share = |(word, distance): (usize, &f32)| (word, (2.0 * SHARPNESS * (nearest - distance)).exp());
+            let share = |(word, distance): (usize, &f32)| (word, libm::expf(2.0 * SHARPNESS * (nearest - distance)));
             self.shares.extend(distances.as_flattened().iter().enumerate().filter(near).map(share));
             let total: f32 = self.shares.iter().map(|(_, share)| share).sum();
             for &(word, share) in &self.shares {

@@ -247,7 +247,7 @@ fn receiver(measured: &Measurement, data: &mut Vec<u8>) {
     data.extend(((place.latitude_deg * 1e7).round() as i32).to_be_bytes());
     data.extend(thousandths(place.altitude_m));
     data.extend(thousandths(place.altitude_m));
-    data.extend(thousandths(east_m.hypot(north_m)));
+    data.extend(thousandths(libm::hypot(east_m, north_m)));
     data.extend(thousandths(up_m));
     for speed_mps in [north_mps, east_mps, -up_mps] {
         data.extend(thousandths(speed_mps));

@@ -18,6 +18,9 @@
 //! NMEA text, a *packet* Xbus binary, a *frame* either. The *arrival* of a frame is when its last byte came in, on the
 //! monotonic clock; its *sample time* is when the receiver measured, on the receiver's clock.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 pub mod decoder;
 pub mod encode;
 mod epoch;

@@ -115,7 +115,7 @@ impl Plausibility {
     fn is_reachable(&self, from: &Place, to: &Place) -> bool {
         let [east_m, north_m, _] = LocalFrame::new(from.position).to_enu_m(to.position);
         let elapsed_s = elapsed_ns(from, to) as f64 / NS_PER_S as f64;
-        east_m.hypot(north_m) <= NOISE_ALLOWANCE_M + self.max_speed_mps * elapsed_s
+        libm::hypot(east_m, north_m) <= NOISE_ALLOWANCE_M + self.max_speed_mps * elapsed_s
     }
 
     /// Counts positions at a new place; `true` once there are enough.

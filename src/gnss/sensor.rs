@@ -133,8 +133,8 @@ impl Sensor {
             quality,
             satellites: receiver.map(|receiver| receiver.satellites),
             horizontal_dilution: None,
-            speed_mps: velocity.map(|[east, north]| east.hypot(north)),
-            course_rad: velocity.map(|[east, north]| north.atan2(east)),
+            speed_mps: velocity.map(|[east, north]| libm::hypot(east, north)),
+            course_rad: velocity.map(|[east, north]| libm::atan2(north, east)),
             source,
         }));
         true

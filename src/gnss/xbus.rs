@@ -313,7 +313,7 @@ fn utc(item: &mut Reader) -> Result<Option<(i64, bool)>, &'static str> {
 fn yaw_of_quaternion([w, x, y, z]: [f64; 4]) -> Option<f64> {
     let length_squared = w * w + x * x + y * y + z * z;
     let is_unit = (0.98..=1.02).contains(&length_squared);
-    is_unit.then(|| (2.0 * (w * z + x * y)).atan2(w * w + x * x - y * y - z * z))
+    is_unit.then(|| libm::atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
 }
 
 /// `!IHBBBBBBIiBBBBiiiiIIiiiiiIIiHHHHHHH` in the words of Python's `struct`.

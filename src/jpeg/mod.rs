@@ -1,5 +1,8 @@
 //! JPEG frames: is it a whole image, how large is it, what a webcam leaves out, and its luma.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod baseline;
 mod bits;
 mod decode;

@@ -140,7 +140,7 @@ impl Belief {
         }
         for k in 0..self.places.len() {
             let place = self.places[k] as usize;
-            self.probability[place] *= self.interpolated(place).exp();
+            self.probability[place] *= libm::expf(self.interpolated(place));
         }
         self.normalize();
     }
@@ -185,7 +185,7 @@ impl Belief {
     pub fn seen_near(&self, position_m: PositionM, factor: f32) -> Mode {
         let middle = [0, 1].map(|axis| (position_m[axis] - self.grid.origin_m[axis]) / self.grid.step_m);
         let hill = gather(self.columns, self.rows, middle, |place| match self.is_candidate[place] {
-            true => (factor * self.weights[place]).exp(),
+            true => libm::expf(factor * self.weights[place]),
             false => 0.0,
         });
         let mode = self.in_metres(&hill);
@@ -312,7 +312,7 @@ fn fill_half_kernel(variance: f64, half: &mut Vec<f32>) {
     }
     let std = variance.sqrt();
     let taps = (KERNEL_STDS * std).ceil() as i32;
-    half.extend((0..=taps).map(|i| (-0.5 * (f64::from(i) / std).powi(2)).exp() as f32));
+    half.extend((0..=taps).map(|i| libm::exp(-0.5 * (f64::from(i) / std).powi(2)) as f32));
     let sum = 2.0 * half.iter().sum::<f32>() - half[0];
     half.iter_mut().for_each(|weight| *weight /= sum);
 }

@@ -68,18 +68,18 @@ impl Compass {
             }
             let yaw_rad = self.yaws_rad[i] - self.sense * turn_rad;
             let weight = correlation.powi(CORRELATION_POWER);
-            sum = [sum[0] + weight * yaw_rad.cos(), sum[1] + weight * yaw_rad.sin()];
+            sum = [sum[0] + weight * libm::cos(yaw_rad), sum[1] + weight * libm::sin(yaw_rad)];
             weights += weight;
         }
         if weights <= 0.0 {
             return None;
         }
         // Headings that disagree have a short mean vector: the deviation of a wrapped normal.
-        let length = (sum[0].hypot(sum[1]) / weights).clamp(1e-9, 1.0);
-        let spread_rad = (-2.0 * length.ln()).sqrt();
+        let length = (libm::hypot(sum[0], sum[1]) / weights).clamp(1e-9, 1.0);
+        let spread_rad = (-2.0 * libm::log(length)).sqrt();
         Some(EstimatedHeading {
-            yaw_rad: wrap_angle_rad(sum[1].atan2(sum[0])),
-            yaw_std_rad: self.std_rad.hypot(spread_rad / (NEIGHBOURS as f64).sqrt()),
+            yaw_rad: wrap_angle_rad(libm::atan2(sum[1], sum[0])),
+            yaw_std_rad: libm::hypot(self.std_rad, spread_rad / (NEIGHBOURS as f64).sqrt()),
         })
     }
 
@@ -118,9 +118,12 @@ fn turn(seen: &[i8], known: &[i8]) -> (f64, f64) {
     // c(φ) = Re Σ C_k exp(ikφ), with its first two derivatives.
     let correlation = |angle_rad: f64| {
         let mut terms = [0.0; 3];
+        let (sin_once, cos_once) = libm::sincos(angle_rad);
+        let (mut sin, mut cos) = (0.0, 1.0);
         for (k, cross) in cross.iter().enumerate() {
             let harmonic = (k + 1) as f64;
-            let (sin, cos) = (harmonic * angle_rad).sin_cos();
+            // exp(ikφ) = exp(i(k − 1)φ) exp(iφ).
+            (sin, cos) = (sin * cos_once + cos * sin_once, cos * cos_once - sin * sin_once);
             let [re, im] = cross.map(|value| value as f64 * scale);
             terms[0] += re * cos - im * sin;
             terms[1] -= harmonic * (re * sin + im * cos);

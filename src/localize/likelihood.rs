@@ -32,7 +32,7 @@ impl FieldOnCells {
         let mut log_normalizer = vec![0.0_f64; cells];
         for row in variance.chunks_exact(cells.max(1)) {
             for (log_normalizer, &p) in log_normalizer.iter_mut().zip(row) {
-                *log_normalizer -= 0.5 * share * (f64::from(p) * TAU).ln();
+                *log_normalizer -= 0.5 * share * libm::log(f64::from(p) * TAU);
             }
         }
         Self {
@@ -104,7 +104,9 @@ impl FieldOnCells {
             *out += weight
                 * match noise {
                     NoiseModel::Gaussian => normalizer - 0.5 * residual,
-                    NoiseModel::UnknownScale => 0.5 * normalizer - 0.5 * count * residual.max(f32::MIN_POSITIVE).ln(),
+                    NoiseModel::UnknownScale => {
+                        0.5 * normalizer - 0.5 * count * libm::logf(residual.max(f32::MIN_POSITIVE))
+                    }
                 };
         }
     }
@@ -116,7 +118,7 @@ impl FieldOnCells {
             let cells = self.mean_of(feature).iter().zip(self.precision_of(feature));
             table.extend(cells.map(|(&mean, &precision)| {
                 let residual = (z - mean).powi(2) * precision;
-                -0.5 * (residual - precision.ln() + TAU.ln() as f32)
+                -0.5 * (residual - libm::logf(precision) + libm::log(TAU) as f32)
             }));
         }
         table
@@ -130,7 +132,7 @@ pub fn log_likelihood_nowhere(features: &[f32], noise: NoiseModel) -> Option<f32
         NoiseModel::Gaussian => None,
         NoiseModel::UnknownScale => {
             let square: f32 = features.iter().map(|z| z * z).sum();
-            Some(-0.5 * features.len() as f32 * square.max(f32::MIN_POSITIVE).ln())
+            Some(-0.5 * features.len() as f32 * libm::logf(square.max(f32::MIN_POSITIVE)))
         }
     }
 }

@@ -10,6 +10,9 @@
 //! `likelihood`, maps that are larger than memory in `large`, the discrete Bayes filter in `belief` and `tracker`, the motion between frames in `motion`, what
 //! a frame is worth beside those before it in `news`, and when a position may be said in `state`.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod belief;
 mod estimate;
 mod heading;

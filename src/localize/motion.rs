@@ -79,7 +79,7 @@ struct Track {
 
 impl Track {
     fn slow_to(&mut self, limit_mps: f64) {
-        let speed_mps = self.velocity_mps[0].hypot(self.velocity_mps[1]);
+        let speed_mps = libm::hypot(self.velocity_mps[0], self.velocity_mps[1]);
         if speed_mps > limit_mps {
             self.velocity_mps = self.velocity_mps.map(|v| v * limit_mps / speed_mps);
         }
@@ -96,7 +96,7 @@ impl MotionModel for ConstantVelocity {
     fn predict(&mut self, dt_s: f64) -> Motion {
         let MotionSettings { speed_limit_mps, acceleration_mps2, diffusion_m } = self.settings;
         // Anywhere within reach: a disc of radius r has the deviation r/2 on either axis.
-        let widest_m = (0.5 * speed_limit_mps * dt_s).hypot(diffusion_m * dt_s.sqrt());
+        let widest_m = libm::hypot(0.5 * speed_limit_mps * dt_s, diffusion_m * dt_s.sqrt());
         let Some(track) = &mut self.track else { return Motion { mean_m: [0.0; 2], std_m: widest_m } };
         let q = acceleration_mps2.powi(2);
         let jitter_m2 = q * dt_s.powi(3) / 3.0 + diffusion_m.powi(2) * dt_s;

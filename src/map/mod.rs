@@ -4,6 +4,9 @@
 //! scaling that turns properties into features, the learning features with the hyperparameters of their Gaussian
 //! processes, and the posterior of every feature on the candidate cells, which is all that matching a frame reads.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod blocks;
 mod cells;
 mod compass;

@@ -21,6 +21,9 @@
 //! localizer noticing. What an output cannot take in time is lost to it, oldest first and whole lines only, and counted.
 //! To record estimates is the recording's: see [`Encoder::estimate`](crate::recording::recorder::Encoder::estimate).
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod inbox;
 pub mod json_lines;
 pub mod nmea;

@@ -5,6 +5,9 @@
 //! next to the first. It is sampled at 1024 × 256 and kept at the three sizes the descriptors use: turning the vehicle
 //! shifts the columns, so anything meant to be yaw-exact starts from the 1024 columns.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod unwrap;
 
 pub use unwrap::UnwrapTable;

@@ -73,7 +73,7 @@ impl UnwrapTable {
             .map(|j| {
                 let turned_rad = TAU * (j as f64 + 0.5) / columns as f64;
                 let angle_rad = donut.start_angle_rad + if donut.clockwise { turned_rad } else { -turned_rad };
-                (angle_rad.cos(), angle_rad.sin())
+                (libm::cos(angle_rad), libm::sin(angle_rad))
             })
             .collect();
         let mut samples = Vec::with_capacity(columns * rows);

@@ -14,6 +14,9 @@
 //! of what they say; `playback` takes a recorded drive through the same survey without any clock. `localize` is the same
 //! for drives that are localized.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod complaints;
 pub mod drive;
 pub mod live;

@@ -2,6 +2,8 @@
 
 use std::collections::VecDeque;
 
+use libm::hypot;
+
 use crate::types::NS_PER_S;
 
 /// Two quartz clocks do not drift apart faster than 1 / this: 100 ppm.
@@ -272,7 +274,7 @@ impl ClockMap {
             _ => 0,
         };
         let above_s = (above_ns as f64 * 1e-9 - CHANCE_ABOVE * self.mean_excess_s).max(0.0);
-        chance_s.hypot(above_s).hypot(self.rise_ns as f64 * 1e-9)
+        hypot(hypot(chance_s, above_s), self.rise_ns as f64 * 1e-9)
     }
 }
 

@@ -1,5 +1,7 @@
 //! Between two samples.
 
+use libm::hypot;
+
 use crate::types::{PositionM, wrap_angle_rad};
 
 /// How a vehicle's acceleration strays from what interpolation assumes, one standard deviation \[m/s²\]: brisk braking
@@ -43,7 +45,7 @@ pub fn interpolate(before: &Waypoint, after: &Waypoint, elapsed_s: f64, gap_s: f
     let line_std_m = ACCELERATION_STD_MPS2 * w * (1.0 - w) * gap_s * gap_s / 2.0;
     let mean_mps = [0, 1].map(|i| if gap_s > 0.0 { (after.position_m[i] - before.position_m[i]) / gap_s } else { 0.0 });
 
-    let agrees = |v: &[f64; 2]| (v[0] - mean_mps[0]).hypot(v[1] - mean_mps[1]) <= MAX_VELOCITY_MISMATCH_MPS;
+    let agrees = |v: &[f64; 2]| hypot(v[0] - mean_mps[0], v[1] - mean_mps[1]) <= MAX_VELOCITY_MISMATCH_MPS;
     match [before, after].map(|fix| fix.velocity_mps.filter(agrees)) {
         [Some(v0), Some(v1)] => {
             let u = 1.0 - w;
@@ -58,7 +60,7 @@ pub fn interpolate(before: &Waypoint, after: &Waypoint, elapsed_s: f64, gap_s: f
             Interpolated {
                 position_m: [cubic(0), cubic(1)],
                 std_m: CUBIC_SHARE * line_std_m,
-                speed_mps: velocity_mps[0].hypot(velocity_mps[1]),
+                speed_mps: hypot(velocity_mps[0], velocity_mps[1]),
             }
         }
         [v0, v1] => {
@@ -66,7 +68,7 @@ pub fn interpolate(before: &Waypoint, after: &Waypoint, elapsed_s: f64, gap_s: f
             Interpolated {
                 position_m: [line(0), line(1)],
                 std_m: line_std_m,
-                speed_mps: velocity_mps[0].hypot(velocity_mps[1]),
+                speed_mps: hypot(velocity_mps[0], velocity_mps[1]),
             }
         }
     }

@@ -23,6 +23,9 @@
 //! [`Synchronizer`] puts this together without a clock, a thread or a file: what it is told in which order decides what
 //! it says, so that a replay says the same. Only [`latency_from_recording`] reads a file.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod camera_turns;
 mod clock_map;
 mod interpolate;

@@ -2,6 +2,8 @@
 
 use std::collections::VecDeque;
 
+use libm::{cos, hypot, sin};
+
 use super::{
     InvalidReason, LatencyEstimate, LatencySource, Pair, Settings,
     clock_map::Verdict,
@@ -250,9 +252,9 @@ impl Synchronizer {
         match (latency.source, clock) {
             (LatencySource::Pulse, ClockKind::Utc) => latency.std_s,
             (LatencySource::Pulse, _) => {
-                latency.std_s.hypot(self.clocks.std_s(clock)).hypot(self.clocks.std_s(ClockKind::Utc))
+                hypot(hypot(latency.std_s, self.clocks.std_s(clock)), self.clocks.std_s(ClockKind::Utc))
             }
-            _ => latency.std_s.hypot(self.clocks.std_s(clock)),
+            _ => hypot(latency.std_s, self.clocks.std_s(clock)),
         }
     }
 
@@ -277,7 +279,7 @@ impl Synchronizer {
         };
         let [east_m, north_m, _] = frame.to_enu_m(fix.position);
         let velocity_mps = match (fix.speed_mps, fix.course_rad) {
-            (Some(speed), Some(course)) => Some([speed * course.cos(), speed * course.sin()]),
+            (Some(speed), Some(course)) => Some([speed * cos(course), speed * sin(course)]),
             (Some(speed), None) if speed < STANDING_MPS => Some([0.0, 0.0]),
             _ => None,
         };
@@ -384,9 +386,10 @@ impl Synchronizer {
             interpolation_gap_m: None,
             serial_latency_s: latency.latency_s,
             serial_latency_m: None,
-            time_std_s: self
-                .time_std_s(latency, before.map_or(ClockKind::Arrival, |(_, fix)| fix.clock))
-                .hypot(STAMP_STD_S),
+            time_std_s: hypot(
+                self.time_std_s(latency, before.map_or(ClockKind::Arrival, |(_, fix)| fix.clock)),
+                STAMP_STD_S,
+            ),
             invalid: None,
         };
         pair.invalid = match (before, after) {
@@ -449,7 +452,7 @@ impl Synchronizer {
             let w = if gap_s > 0.0 { elapsed_s / gap_s } else { 0.0 };
             let fix_m = (1.0 - w) * before_m + w * after_m;
             let along_m = found.speed_mps * pair.time_std_s / std::f64::consts::SQRT_2;
-            pair.position_std_m = Some(fix_m.hypot(found.std_m).hypot(along_m));
+            pair.position_std_m = Some(hypot(hypot(fix_m, found.std_m), along_m));
         }
         if gap_s > self.settings.max_gap_s {
             return Some(InvalidReason::Gap { gap_s });

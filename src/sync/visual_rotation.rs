@@ -124,11 +124,13 @@ impl RotationTracker {
             correlation: inverse.make_output_vec(),
             scratch: vec![Complex::ZERO; scratch_length],
             sideways: (0..WIDE_COLUMNS)
-                .map(|column| (TAU * (column as f64 + 0.5) / WIDE_COLUMNS as f64).sin().abs())
+                .map(|column| libm::sin(TAU * (column as f64 + 0.5) / WIDE_COLUMNS as f64).abs())
                 .collect(),
             columns: std::array::from_fn(|_| vec![0.0; WIDE_COLUMNS]),
             along: (0..WIDE_COLUMNS)
-                .map(|column| (TAU * (column as f64 + 0.5) / WIDE_COLUMNS as f64).cos().powi(4) / WIDE_COLUMNS as f64)
+                .map(|column| {
+                    libm::cos(TAU * (column as f64 + 0.5) / WIDE_COLUMNS as f64).powi(4) / WIDE_COLUMNS as f64
+                })
                 .collect(),
             forward,
             inverse,

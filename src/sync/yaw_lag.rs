@@ -132,7 +132,7 @@ impl YawLag {
         let std_s = all.std_s().max(spread_s(&pieces, &all)).max(MIN_STD_S);
         let turns = pieces.len();
         let unseen_s = if turns < SPREADING_TURNS { TURN_STD_S / (turns as f64).sqrt() } else { 0.0 };
-        (std_s <= MAX_STD_S).then_some(LagEstimate { lag_s: all.lag_s, std_s: std_s.hypot(unseen_s), turns })
+        (std_s <= MAX_STD_S).then_some(LagEstimate { lag_s: all.lag_s, std_s: libm::hypot(std_s, unseen_s), turns })
     }
 }
 

@@ -10,7 +10,7 @@ pub type PositionM = [f64; 2];
 
 /// Euclidean distance between two positions \[m\].
 pub fn distance_m(a: PositionM, b: PositionM) -> f64 {
-    (a[0] - b[0]).hypot(a[1] - b[1])
+    libm::hypot(a[0] - b[0], a[1] - b[1])
 }
 
 /// The same direction in (−π, π].

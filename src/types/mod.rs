@@ -1,5 +1,8 @@
 //! Words every folder may use. Nothing here uses anything else of ours.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod calibration;
 mod estimate;
 mod geodesy;

@@ -78,7 +78,7 @@ impl LensCheck {
             }
         }
         let by_px = [found.center_x_px - expected.center_x_px, found.center_y_px - expected.center_y_px];
-        match by_px[0].hypot(by_px[1]) {
+        match libm::hypot(by_px[0], by_px[1]) {
             distance_px if distance_px <= SAME_PX => LensVerdict::Fits,
             distance_px if distance_px <= SLIPPED_PX => {
                 let calibration = DonutCalibration {
