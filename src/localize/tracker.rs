@@ -145,7 +145,7 @@ impl Tracker {
     }
 
     pub(super) fn speed_mps(&self) -> Option<f64> {
-        self.motion.velocity_mps().map(|[east, north]| east.hypot(north))
+        self.motion.velocity_mps().map(|[east, north]| libm::hypot(east, north))
     }
 
     pub(super) fn state(&self) -> LocalizationState {

@@ -148,7 +148,7 @@ impl TensorFile {
 }
 
 fn bytes_of(dtype: Dtype) -> Option<usize> {
-    (dtype.bitsize() % 8 == 0).then(|| dtype.bitsize() / 8)
+    dtype.bitsize().is_multiple_of(8).then(|| dtype.bitsize() / 8)
 }
 
 /// Numbers that a map may hold.
