@@ -11,7 +11,8 @@ use std::{
 
 use common::map::{folder, map};
 use omniloc::{
-    localize::{Localizer, MotionSettings},
+    localize::{FIELDS_IN_MEMORY_BYTES, Localizer, MotionSettings},
+    map::OpenMap,
     types::{LocalizationState, NS_PER_S},
 };
 
@@ -47,7 +48,7 @@ static ALLOCATOR: Counting = Counting;
 
 #[test]
 fn nothing_is_allocated_for_a_frame() {
-    let map = omniloc::map::file::read(fs::File::open(map()).expect("a map")).expect("sound");
+    let map = OpenMap::open(Box::new(fs::File::open(map()).expect("a map"))).expect("sound");
     let mut images: Vec<PathBuf> = fs::read_dir(folder().join("dataset/images"))
         .expect("images")
         .map(|entry| entry.expect("an entry").path())
@@ -55,7 +56,7 @@ fn nothing_is_allocated_for_a_frame() {
     images.sort();
     let jpegs: Vec<Vec<u8>> = images.iter().map(|path| fs::read(path).expect("readable")).collect();
     let mut localizer =
-        Localizer::new(&map, &map.info.calibration, MotionSettings::default()).expect("a donut within the images");
+        Localizer::new(map, MotionSettings::default(), FIELDS_IN_MEMORY_BYTES).expect("a donut within the images");
     let mut localized = 0;
     // Buffers grow with the largest frame: the second time round they have all been seen.
     for (sequence, jpeg) in (0_u32..).zip(jpegs.iter().chain(&jpegs)) {

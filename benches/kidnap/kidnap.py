@@ -1,6 +1,6 @@
 """Kidnaps: a drive is cut and joined so that the vehicle jumps, and localized on a map.
 
-    python3 benches/kidnap/kidnap.py AREA.map DATASET [--count 30] [--least-m 40] [--truth CSV]
+    python3 benches/kidnap/kidnap.py AREA.map DATASET [--count 30] [--least-m 40] [--truth CSV] [--config FILE]
 
 DATASET is a folder that `omniloc import` reads, of another day than the map's. Needs nothing but the program
 (target/release/omniloc). Prints, for every kidnap, after how many frames it was noticed, after how many the position was
@@ -23,7 +23,7 @@ BEFORE, AFTER = 20, 30
 WRONG_M = 10.0
 
 
-def localize(folder, frames, source, rows, area, origin):
+def localize(folder, frames, source, rows, area, origin, config):
     """States and positions of the frames `frames` of `rows`, one second apart, as a drive of its own."""
     dataset = folder / "dataset"
     shutil.rmtree(dataset, ignore_errors=True)
@@ -45,7 +45,7 @@ def localize(folder, frames, source, rows, area, origin):
             out.writerow([number, f"{number:05}.jpg", row["x_m"], row["y_m"], row["yaw_rad"], f"{start_s:.4f}"])
     recording = folder / "drive.mcap"
     subprocess.run([PROGRAM, "import", dataset, "--out", recording, "--force", *origin], check=True, capture_output=True)
-    command = [PROGRAM, "replay", recording, "--mode", "localize", "--map", area]
+    command = [PROGRAM, "replay", recording, "--mode", "localize", "--map", area, *config]
     lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
     return [json.loads(line) for line in lines]
 
@@ -58,6 +58,7 @@ def main():
     parser.add_argument("--least-m", type=float, default=40.0)
     parser.add_argument("--truth", type=Path, help="CSV index,x_m,y_m: where the vehicle really was")
     parser.add_argument("--origin", help="as for `omniloc import`")
+    parser.add_argument("--config", help="as for `omniloc replay`: `[map] memory_mib = 0` to have the map read as it is needed")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     source = args.dataset.resolve()
@@ -66,6 +67,7 @@ def main():
     place = lambda row: (float(row["x_m"]), float(row["y_m"]))
     places = [place(truth[int(row["index"])] if truth else row) for row in rows]
     origin = ["--origin", args.origin] if args.origin else []
+    config = ["--config", args.config] if args.config else []
     chance = random.Random(args.seed)
     noticed, known, wrong = [], [], 0
     with tempfile.TemporaryDirectory() as temporary:
@@ -76,7 +78,7 @@ def main():
             if math.dist(places[i], places[j]) < args.least_m:
                 continue
             frames = list(range(i - BEFORE, i)) + list(range(j, j + AFTER))
-            found = localize(folder, frames, source, rows, args.area, origin)
+            found = localize(folder, frames, source, rows, args.area, origin, config)
             after = found[BEFORE:]
             silent = next((k for k, line in enumerate(after) if line["state"] != "localized"), None)
             error = lambda k: math.dist((after[k]["e_m"], after[k]["n_m"]), places[j + k])

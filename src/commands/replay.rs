@@ -151,10 +151,10 @@ fn localize_as_fast_as_it_goes(
     recording: &Recording,
     config: &LocalizeConfig,
 ) -> anyhow::Result<ExitCode> {
-    let map = live::read_map(&config.map.file)?;
+    let map = live::open_map(&config.map.file)?;
     let map_frame = map.info.origin.map(LocalFrame::new);
     let log_offset_ns = drive::log_offset_ns(recording);
-    let mut session = Session::new(map, config.motion).with_context(|| config.map.file.display().to_string())?;
+    let mut session = live::start_session(map, config)?;
     let mut stdout = BufWriter::new(std::io::stdout().lock());
     let mut line = Vec::new();
     let mut each = |estimate: &PositionEstimate| {

@@ -5,7 +5,12 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{Camera, ConfigError, Fault, Replay, Vehicle, load, read_camera, tables::Tables};
-use crate::{devices::simulated, localize::MotionSettings, outputs, recording::recorder};
+use crate::{
+    devices::simulated,
+    localize::{FIELDS_IN_MEMORY_BYTES, MotionSettings},
+    outputs,
+    recording::recorder,
+};
 
 /// Everything `omniloc localize` needs to know.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -31,6 +36,29 @@ pub struct LocalizeConfig {
 pub struct Map {
     /// Made by `omniloc train`.
     pub file: PathBuf,
+    /// So much of the map's fields may be in memory; a larger map is read as the vehicle needs it.
+    #[serde(default = "default_memory_mib")]
+    pub memory_mib: u32,
+}
+
+/// More is no limit.
+const MAX_MEMORY_MIB: u32 = 1 << 20;
+
+fn default_memory_mib() -> u32 {
+    (FIELDS_IN_MEMORY_BYTES >> 20) as u32
+}
+
+impl Map {
+    pub fn memory_bytes(&self) -> usize {
+        (self.memory_mib as usize) << 20
+    }
+
+    fn check(&self) -> Result<(), String> {
+        match self.memory_mib {
+            0..=MAX_MEMORY_MIB => Ok(()),
+            memory_mib => Err(format!("memory_mib = {memory_mib}: expected 0 to {MAX_MEMORY_MIB}")),
+        }
+    }
 }
 
 impl LocalizeConfig {
@@ -47,7 +75,7 @@ impl LocalizeConfig {
         let config = Self {
             vehicle: tables.required("vehicle")?.read(Vehicle::check)?,
             camera: read_camera(tables.required("camera")?)?,
-            map: tables.required("map")?.read(|_| Ok(()))?,
+            map: tables.required("map")?.read(Map::check)?,
             motion: tables.or_empty("motion").read(MotionSettings::check)?,
             outputs: tables.or_empty("outputs").read(outputs::Settings::check)?,
             recorder: tables.optional("recorder").map(|table| table.read(recorder::Settings::check)).transpose()?,
@@ -78,14 +106,17 @@ impl LocalizeConfig {
         self.recorder.iter_mut().for_each(|recorder| resolve(&mut recorder.folder));
     }
 
-    /// The frames of a recording on a map; `given`: how the vehicle moves, and where estimates go, which is stdout if
+    /// The frames of a recording on a map; `given`: how the vehicle moves, how much memory there is, and where estimates go, which is stdout if
     /// nothing is given.
     pub fn for_replay(recording: &Path, name: &str, map: &Path, given: Option<&Self>) -> Self {
         let stdout = Some(outputs::StdoutSettings::default());
         Self {
             vehicle: Vehicle { name: name.into(), calibration: None },
             camera: Camera::Replay(Replay { recording: recording.into() }),
-            map: Map { file: map.into() },
+            map: Map {
+                file: map.into(),
+                memory_mib: given.map_or_else(default_memory_mib, |given| given.map.memory_mib),
+            },
             motion: given.map(|given| given.motion).unwrap_or_default(),
             outputs: given.map_or(outputs::Settings { stdout, ..Default::default() }, |given| given.outputs.clone()),
             recorder: None,
@@ -142,6 +173,11 @@ mod tests {
             ("[map]\nfile = \"area.map\"", "", "the table [map] is missing"),
             ("driver = \"replay\"\nrecording = \"a.mcap\"", "driver = \"none\"", "localizing needs a camera"),
             ("[map]", "[motion]\nspeed_limit_mps = 0.0\n[map]", "[motion]: speed_limit_mps = 0: expected 0.1 to 200"),
+            (
+                "file = \"area.map\"",
+                "file = \"a\"\nmemory_mib = 9999999",
+                "memory_mib = 9999999: expected 0 to 1048576",
+            ),
             ("[map]", "[motion]\nspeed_kmh = 3\n[map]", "[motion]: unknown field `speed_kmh`"),
             ("[map]", "[gnss]\ndriver = \"none\"\n[map]", "unknown table or key `gnss`, expected [vehicle]"),
             ("[map]", "[[outputs.nmea_tcp]]\nlisten = \"here\"\n[map]", "an IP address and a port"),

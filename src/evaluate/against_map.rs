@@ -1,10 +1,11 @@
 //! Frames of another drive against a map.
 
+use faer::Mat;
 use rayon::prelude::*;
 
 use super::sequence::{Sequence, sequences};
 use crate::features::COMPASS_BYTES;
-use crate::localize::{FieldOnCells, Observation};
+use crate::localize::{MapFields, Observation};
 use crate::map::FeatureMap;
 use crate::train::{Survey, covers, locate};
 use crate::types::PositionM;
@@ -33,7 +34,7 @@ pub struct AgainstMap {
 
 /// Estimates for every frame of `survey`, which in truth are at `truth_m`.
 pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> AgainstMap {
-    let fields: Vec<FieldOnCells> = map.groups.iter().map(FieldOnCells::of).collect();
+    let fields = MapFields::of(map);
     let rows: Vec<usize> = (0..survey.len()).collect();
     let features: Vec<_> = map
         .info
@@ -43,31 +44,26 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
         .map(|(info, group)| group.scaling.apply(survey.properties(info.recipe.descriptor, &rows).as_ref()))
         .collect();
 
+    let groups = &map.info.groups;
+
     // Per frame: an estimate a group, and the fused one last.
     let answers: Vec<Answer> = rows
         .par_iter()
         .map_init(Vec::new, |scratch, &row| {
-            let mut fused = vec![0.0; map.cells.len()];
-            let mut nowhere = Some(0.0);
-            let mut all_features = Vec::new();
-            let mut estimates_m: Vec<PositionM> = fields
-                .iter()
-                .zip(&map.info.groups)
-                .zip(&features)
-                .map(|((field, info), features)| {
-                    let z: Vec<f32> = (0..field.features()).map(|r| features[(row, r)] as f32).collect();
-                    all_features.extend_from_slice(&z);
-                    let mut alone = vec![0.0; map.cells.len()];
-                    field.add_log_likelihood(&z, info.recipe.noise, info.recipe.weight as f32, scratch, &mut alone);
-                    fused.iter_mut().zip(&alone).for_each(|(sum, value)| *sum += value);
-                    let of_group = field.log_likelihood_nowhere(&z, info.recipe.noise);
-                    nowhere = nowhere.zip(of_group).map(|(sum, value)| sum + info.recipe.weight as f32 * value);
-                    locate(&map.cells, &alone, map.info.refine)
-                })
-                .collect();
-            estimates_m.push(locate(&map.cells, &fused, map.info.refine));
-            let is_covered = covers(&map.cells, &fused, truth_m[row], map.info.temperature, 0.95);
-            Answer { estimates_m, is_covered, features: all_features, log_likelihood: fused, nowhere }
+            let of_row = |features: &Mat<f64>| features.row(row).iter().map(|&z| z as f32).collect::<Vec<_>>();
+            let features: Vec<f32> = features.iter().flat_map(of_row).collect();
+            let mut log_likelihood = vec![0.0; map.cells.len()];
+            let mut estimates_m = Vec::with_capacity(groups.len() + 1);
+            for group in 0..groups.len() {
+                fields.log_likelihood_of_group(group, &features, scratch, &mut log_likelihood);
+                estimates_m.push(locate(&map.cells, &log_likelihood, map.info.refine));
+            }
+            log_likelihood.fill(0.0);
+            fields.add_log_likelihood(&features, scratch, &mut log_likelihood);
+            estimates_m.push(locate(&map.cells, &log_likelihood, map.info.refine));
+            let is_covered = covers(&map.cells, &log_likelihood, truth_m[row], map.info.temperature, 0.95);
+            let nowhere = MapFields::log_likelihood_nowhere(groups, &features);
+            Answer { estimates_m, is_covered, features, log_likelihood, nowhere }
         })
         .collect();
     let covered = answers.iter().filter(|answer| answer.is_covered).count() as f64 / survey.len().max(1) as f64;
@@ -84,7 +80,7 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
             rank: group.rank,
             kept: group.features,
             estimates_m: column(i),
-            coverage_95: (fields.len() == 1).then_some(covered),
+            coverage_95: (groups.len() == 1).then_some(covered),
         })
         .collect();
     if outcomes.len() > 1 {

@@ -74,6 +74,25 @@ impl Belief {
         belief
     }
 
+    /// The same belief on other cells of the same grid: what lies outside them is forgotten, and cells that it did not know
+    /// before have nothing.
+    pub fn on(&self, cells: &CandidateCells) -> Self {
+        let mut belief = Self::uniform(cells);
+        let steps = |axis: usize| (belief.grid.origin_m[axis] - self.grid.origin_m[axis]) / self.grid.step_m;
+        let [right, up] = [steps(0), steps(1)].map(|steps| steps.round() as i64);
+        for &[i, j] in cells.indices() {
+            let ours = [i64::from(i) + right, i64::from(j) + up].map(usize::try_from);
+            let probability = match ours {
+                [Ok(i), Ok(j)] if i < self.columns && j < self.rows => self.probability[j * self.columns + i],
+                _ => 0.0,
+            };
+            belief.probability[(j * cells.grid.columns + i) as usize] = probability;
+        }
+        (belief.offset, belief.unspread) = (self.offset, self.unspread);
+        belief.normalize();
+        belief
+    }
+
     /// Makes every cell alike again.
     pub fn forget(&mut self) {
         let each = 1.0 / self.places.len() as f32;
@@ -406,6 +425,27 @@ mod tests {
         belief.spread([500.0, 0.0], 0.0);
         let mode = belief.mode();
         assert!(mode.probability < 0.1, "{mode:?}");
+    }
+
+    #[test]
+    fn a_part_of_the_cells_knows_what_the_whole_knew() {
+        let cells = cells();
+        let mut belief = Belief::uniform(&cells);
+        belief.weigh(&hill_at(&cells, [20.0, 15.0], 1.0), 1.0);
+        belief.spread([0.3, -0.2], 0.1);
+        let part = belief.on(&cells.within(24..60, 10..50));
+        let same = |a: Mode, b: Mode| {
+            assert!(
+                (a.mean_m[0] - b.mean_m[0]).abs() < 1e-3 && (a.mean_m[1] - b.mean_m[1]).abs() < 1e-3,
+                "{a:?} {b:?}"
+            );
+            assert!((a.covariance.ee_m2 / b.covariance.ee_m2 - 1.0).abs() < 1e-3, "{a:?} {b:?}");
+        };
+        same(part.mode(), belief.mode());
+        same(part.on(&cells).mode(), belief.mode());
+        // Nothing is left where nothing was.
+        let elsewhere = belief.on(&cells.within(0..5, 0..5)).mode();
+        assert!(elsewhere.mean_m[0] < 3.0, "{elsewhere:?}");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use multiversion::multiversion;
 
-use crate::map::{MapGroup, NoiseModel};
+use crate::map::{FeatureMap, GroupField, GroupInfo, MapGroup, NoiseModel};
 
 /// A group's Gaussian processes on the candidate cells.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,13 +42,6 @@ impl FieldOnCells {
             precision: variance.iter().map(|p| 1.0 / p).collect(),
             log_normalizer: log_normalizer.into_iter().map(|value| value as f32).collect(),
         }
-    }
-
-    /// Those of a map.
-    pub fn of(group: &MapGroup) -> Self {
-        let features = group.scaling.features();
-        let cells = group.field_mean.len() / features.max(1);
-        Self::new(features, cells, group.field_mean.clone(), &group.field_variance)
     }
 
     pub fn features(&self) -> usize {
@@ -118,18 +111,6 @@ impl FieldOnCells {
         }
     }
 
-    /// The log-likelihood of `features` at a place of which nothing is known, whose predicted mean is that of all places,
-    /// up to a constant of the field: what the best cell is compared with. `None` for a noise model that has none.
-    pub fn log_likelihood_nowhere(&self, features: &[f32], noise: NoiseModel) -> Option<f32> {
-        match noise {
-            NoiseModel::Gaussian => None,
-            NoiseModel::UnknownScale => {
-                let square: f32 = features.iter().map(|z| z * z).sum();
-                Some(-0.5 * self.features as f32 * libm::logf(square.max(f32::MIN_POSITIVE)))
-            }
-        }
-    }
-
     /// Eq. 10 of every feature on its own, feature × cell.
     pub fn log_likelihood_of_each(&self, features: &[f32]) -> Vec<f32> {
         let mut table = Vec::with_capacity(self.features * self.cells);
@@ -141,6 +122,83 @@ impl FieldOnCells {
             }));
         }
         table
+    }
+}
+
+/// The log-likelihood of `features` at a place of which nothing is known, whose predicted mean is that of all places, up to
+/// a constant of the field: what the best cell is compared with. `None` for a noise model that has none.
+pub fn log_likelihood_nowhere(features: &[f32], noise: NoiseModel) -> Option<f32> {
+    match noise {
+        NoiseModel::Gaussian => None,
+        NoiseModel::UnknownScale => {
+            let square: f32 = features.iter().map(|z| z * z).sum();
+            Some(-0.5 * features.len() as f32 * libm::logf(square.max(f32::MIN_POSITIVE)))
+        }
+    }
+}
+
+/// The fields of a map's groups on the same cells, each with what it counts.
+#[derive(Debug, Clone)]
+pub struct MapFields {
+    groups: Vec<(FieldOnCells, NoiseModel, f32)>,
+}
+
+impl MapFields {
+    /// `fields`, on `cells` cells each, of `groups`.
+    pub fn new(groups: &[GroupInfo], cells: usize, fields: impl IntoIterator<Item = GroupField>) -> Self {
+        let of_group = |(info, field): (&GroupInfo, GroupField)| {
+            let GroupField { mean, variance } = field;
+            let field = FieldOnCells::new(info.features, cells, mean, &variance);
+            (field, info.recipe.noise, info.recipe.weight as f32)
+        };
+        Self { groups: groups.iter().zip(fields).map(of_group).collect() }
+    }
+
+    /// Those of a map, on all its cells.
+    pub fn of(map: &FeatureMap) -> Self {
+        let of_group =
+            |group: &MapGroup| GroupField { mean: group.field_mean.clone(), variance: group.field_variance.clone() };
+        Self::new(&map.info.groups, map.cells.len(), map.groups.iter().map(of_group))
+    }
+
+    /// Adds the log-likelihood of a frame's features, one group's behind the other's, at every cell. `scratch` is
+    /// overwritten.
+    ///
+    /// # Panics
+    /// When `features` or `log_likelihood` is of another length than the fields.
+    pub fn add_log_likelihood(&self, features: &[f32], scratch: &mut Vec<f32>, log_likelihood: &mut [f32]) {
+        let mut rest = features;
+        for (field, noise, weight) in &self.groups {
+            let of_group;
+            (of_group, rest) = rest.split_at(field.features());
+            field.add_log_likelihood(of_group, *noise, *weight, scratch, log_likelihood);
+        }
+    }
+
+    /// The log-likelihood by one group alone, in place of what is in `log_likelihood`.
+    pub fn log_likelihood_of_group(
+        &self,
+        group: usize,
+        features: &[f32],
+        scratch: &mut Vec<f32>,
+        log_likelihood: &mut [f32],
+    ) {
+        let before: usize = self.groups[..group].iter().map(|(field, ..)| field.features()).sum();
+        let (field, noise, weight) = &self.groups[group];
+        log_likelihood.fill(0.0);
+        let features = &features[before..before + field.features()];
+        field.add_log_likelihood(features, *noise, *weight, scratch, log_likelihood);
+    }
+
+    /// The log-likelihood of a frame's features at no place, which all cells' are compared with; `None` where a group's
+    /// noise model has none.
+    pub fn log_likelihood_nowhere(groups: &[GroupInfo], features: &[f32]) -> Option<f32> {
+        let mut rest = features;
+        groups.iter().try_fold(0.0, |sum, group| {
+            let of_group;
+            (of_group, rest) = rest.split_at(group.features);
+            Some(sum + group.recipe.weight as f32 * log_likelihood_nowhere(of_group, group.recipe.noise)?)
+        })
     }
 }
 

@@ -2,14 +2,19 @@
 
 use std::time::{Duration, Instant};
 
-use super::likelihood::FieldOnCells;
+use super::large::{Features, LargeMap};
+use super::likelihood::MapFields;
 use super::motion::MotionSettings;
 use super::tracker::{Observation, Tracked, Tracker};
+use crate::features::scaling::Scaling;
 use crate::features::{COMPASS_BYTES, Describer, Descriptor};
 use crate::jpeg::{JpegError, LumaDecoder};
-use crate::map::{FeatureMap, NoiseModel};
+use crate::map::{MapError, MapInfo, OpenMap};
 use crate::panorama::{Panorama, UnwrapTable};
 use crate::types::{CalibrationError, DonutCalibration, PositionEstimate};
+
+/// Of a map's fields, so many bytes stay in memory; a map that has more is read as it is needed.
+pub const FIELDS_IN_MEMORY_BYTES: usize = 32 << 20;
 
 /// Localizes the frames of one camera on one map.
 pub struct Localizer {
@@ -19,7 +24,9 @@ pub struct Localizer {
     panorama: Panorama,
     descriptors: Vec<Descriptor>,
     properties: Vec<Vec<f32>>,
-    groups: Vec<Group>,
+    info: MapInfo,
+    scalings: Vec<RowScaling>,
+    fields: Fields,
     /// Of all groups, one behind the other.
     features: Vec<f32>,
     log_likelihood: Vec<f32>,
@@ -29,14 +36,38 @@ pub struct Localizer {
     timings: Timings,
 }
 
-/// One descriptor's part: z = W (y − μ) and the field of z on the cells.
-struct Group {
+/// z = W (y − μ) in single precision.
+struct RowScaling {
     mean: Vec<f32>,
     /// W, row by row.
     projection: Vec<f32>,
-    field: FieldOnCells,
-    noise: NoiseModel,
-    weight: f32,
+}
+
+/// What frames are matched with.
+enum Fields {
+    /// All of it is in memory.
+    Whole(MapFields),
+    Large(Box<LargeMap>),
+}
+
+/// Why there is no localizing on a map.
+#[derive(Debug, thiserror::Error)]
+pub enum LocalizerError {
+    #[error("the map's donut does not lie within its images")]
+    Calibration(#[from] CalibrationError),
+    #[error(transparent)]
+    Map(#[from] MapError),
+}
+
+/// Why a frame has no estimate of its own.
+#[derive(Debug, thiserror::Error)]
+pub enum FrameError {
+    /// The frame cannot be used; [`Localizer::skip`] gives the estimate.
+    #[error(transparent)]
+    Jpeg(#[from] JpegError),
+    /// Nothing can be said any more.
+    #[error("the map cannot be read any more")]
+    Map(#[from] MapError),
 }
 
 /// The steps of a frame.
@@ -93,57 +124,68 @@ impl Timings {
 }
 
 impl Localizer {
-    /// `calibration`: where the donut is now; the map's own, or a little beside it.
+    /// `memory_bytes`: how much of the map's fields may be in memory.
     ///
     /// # Errors
-    /// When the donut does not lie within the map's images.
-    pub fn new(
-        map: &FeatureMap,
-        calibration: &DonutCalibration,
-        settings: MotionSettings,
-    ) -> Result<Self, CalibrationError> {
-        let [width_px, height_px] = map.info.image_size_px;
-        let descriptors: Vec<Descriptor> = map.info.groups.iter().map(|group| group.recipe.descriptor).collect();
-        let groups = map.info.groups.iter().zip(&map.groups).map(|(info, group)| Group {
-            mean: group.scaling.mean.iter().map(|&mean| mean as f32).collect(),
-            projection: (0..group.scaling.features())
-                .flat_map(|r| group.scaling.projection.row(r).iter().map(|&w| w as f32).collect::<Vec<_>>())
-                .collect(),
-            field: FieldOnCells::of(group),
-            noise: info.recipe.noise,
-            weight: info.recipe.weight as f32,
-        });
+    /// When the donut does not lie within the map's images, or the map cannot be read.
+    pub fn new(map: OpenMap, settings: MotionSettings, memory_bytes: usize) -> Result<Self, LocalizerError> {
+        let info = map.info.clone();
+        let descriptors: Vec<Descriptor> = info.groups.iter().map(|group| group.recipe.descriptor).collect();
+        let cells = map.cells.clone();
+        let scalings: Vec<RowScaling> = map.scalings.iter().map(RowScaling::of).collect();
+        let (fields, compass) = if map.fields_bytes() <= memory_bytes {
+            let fields = MapFields::new(&info.groups, cells.len(), map.all_fields()?);
+            (Fields::Whole(fields), map.compass(|_| true)?)
+        } else {
+            (Fields::Large(Box::new(LargeMap::new(map, memory_bytes, settings))), None)
+        };
         Ok(Self {
             decoder: LumaDecoder::new(),
-            table: UnwrapTable::build(calibration, width_px, height_px)?,
+            table: table(&info, &info.calibration)?,
             describer: Describer::new(),
             panorama: Panorama::zeros(),
             properties: Describer::room_for(&descriptors),
-            groups: groups.collect(),
             descriptors,
-            features: vec![0.0; map.groups.iter().map(|group| group.scaling.features()).sum()],
-            log_likelihood: vec![0.0; map.cells.len()],
-            scratch: Vec::with_capacity(map.cells.len()),
+            features: vec![0.0; info.groups.iter().map(|group| group.features).sum()],
+            log_likelihood: vec![0.0; cells.len()],
+            scratch: Vec::with_capacity(cells.len()),
             compass: vec![0; COMPASS_BYTES],
-            tracker: Tracker::new(map, settings),
+            tracker: Tracker::on_cells(&info, &cells, compass, settings),
             timings: Timings::default(),
+            info,
+            scalings,
+            fields,
         })
+    }
+
+    /// What the map says of itself.
+    pub fn map_info(&self) -> &MapInfo {
+        &self.info
+    }
+
+    /// Goes on with a donut that is elsewhere in the images, as if nothing had been seen before.
+    ///
+    /// # Errors
+    /// When the donut does not lie within the map's images.
+    pub fn look_through(&mut self, calibration: &DonutCalibration) -> Result<(), CalibrationError> {
+        self.table = table(&self.info, calibration)?;
+        self.tracker.start_again();
+        Ok(())
     }
 
     /// The estimate after a frame. One that cannot be decoded, or is of another size than the map's, is skipped.
     ///
     /// # Errors
-    /// Why the frame was skipped; [`skip`](Self::skip) gives the estimate.
-    pub fn take(&mut self, sequence: u32, stamp_ns: u64, jpeg: &[u8]) -> Result<Tracked, JpegError> {
+    /// Why the frame was skipped; or that the map's file has been damaged.
+    pub fn take(&mut self, sequence: u32, stamp_ns: u64, jpeg: &[u8]) -> Result<Tracked, FrameError> {
         let mut watch = Stopwatch::start();
         let image = self.decoder.decode_needed(jpeg, self.table.needed())?;
         let expected = self.table.image_size_px();
         if (image.width_px, image.height_px) != expected {
             let (found_w, found_h) = (image.width_px, image.height_px);
             let (width_px, height_px) = expected;
-            return Err(JpegError::Damaged(format!(
-                "it has {found_w} x {found_h} px, the map's images have {width_px} x {height_px} px"
-            )));
+            let what = format!("it has {found_w} x {found_h} px, the map's images have {width_px} x {height_px} px");
+            return Err(JpegError::Damaged(what).into());
         }
         watch.lap(Stage::Decode);
         self.table.unwrap_into(image, 0, &mut self.panorama);
@@ -151,7 +193,8 @@ impl Localizer {
         self.describer.describe(&self.descriptors, &self.panorama, &mut self.properties);
         self.describer.compass(&self.descriptors, &self.panorama, &mut self.compass);
         watch.lap(Stage::Describe);
-        let nowhere = self.match_cells();
+        self.scale();
+        let nowhere = self.match_cells(stamp_ns)?;
         watch.lap(Stage::Match);
         let observation = Observation {
             sequence,
@@ -176,23 +219,48 @@ impl Localizer {
         &self.timings
     }
 
-    /// Properties → features → log-likelihood of every cell, and of no place.
-    fn match_cells(&mut self) -> Option<f32> {
-        self.log_likelihood.fill(0.0);
-        let mut nowhere = Some(0.0);
+    /// Properties → features.
+    fn scale(&mut self) {
         let mut rest = self.features.as_mut_slice();
-        for (group, properties) in self.groups.iter().zip(&mut self.properties) {
+        for (scaling, properties) in self.scalings.iter().zip(&mut self.properties) {
+            properties.iter_mut().zip(&scaling.mean).for_each(|(property, mean)| *property -= mean);
             let features;
-            (features, rest) = rest.split_at_mut(group.field.features());
-            properties.iter_mut().zip(&group.mean).for_each(|(property, mean)| *property -= mean);
-            let rows = group.projection.chunks_exact(properties.len());
+            (features, rest) = rest.split_at_mut(scaling.projection.len() / properties.len());
+            let rows = scaling.projection.chunks_exact(properties.len());
             features.iter_mut().zip(rows).for_each(|(feature, row)| *feature = dot(row, properties));
-            let Group { field, noise, weight, .. } = group;
-            field.add_log_likelihood(features, *noise, *weight, &mut self.scratch, &mut self.log_likelihood);
-            let of_group = field.log_likelihood_nowhere(features, *noise);
-            nowhere = nowhere.zip(of_group).map(|(sum, value)| sum + weight * value);
         }
-        nowhere
+    }
+
+    /// Features → log-likelihood of every cell, and of no place.
+    fn match_cells(&mut self, stamp_ns: u64) -> Result<Option<f32>, MapError> {
+        let Self { features, scratch, log_likelihood, .. } = self;
+        let nowhere = MapFields::log_likelihood_nowhere(&self.info.groups, features);
+        match &mut self.fields {
+            Fields::Whole(fields) => {
+                log_likelihood.fill(0.0);
+                fields.add_log_likelihood(features, scratch, log_likelihood);
+            }
+            Fields::Large(map) => {
+                let frame = Features { stamp_ns, features, nowhere };
+                map.match_frame(&frame, &mut self.tracker, scratch, log_likelihood)?;
+            }
+        }
+        Ok(nowhere)
+    }
+}
+
+fn table(info: &MapInfo, calibration: &DonutCalibration) -> Result<UnwrapTable, CalibrationError> {
+    let [width_px, height_px] = info.image_size_px;
+    UnwrapTable::build(calibration, width_px, height_px)
+}
+
+impl RowScaling {
+    fn of(scaling: &Scaling) -> Self {
+        let rows = (0..scaling.features()).flat_map(|r| scaling.projection.row(r).iter());
+        Self {
+            mean: scaling.mean.iter().map(|&mean| mean as f32).collect(),
+            projection: rows.map(|&w| w as f32).collect(),
+        }
     }
 }
 

@@ -7,7 +7,7 @@
 //!
 //! [`Localizer`] takes frames all the way; [`Tracker`] is the part from the log-likelihood on, which also serves drives
 //! that are evaluated offline, where [`smooth`] adds what later frames say of earlier ones. The likelihood is in
-//! `likelihood`, the discrete Bayes filter in `belief` and `tracker`, the motion between frames in `motion`, what
+//! `likelihood`, maps that are larger than memory in `large`, the discrete Bayes filter in `belief` and `tracker`, the motion between frames in `motion`, what
 //! a frame is worth beside those before it in `news`, and when a position may be said in `state`.
 
 // The same estimates on every computer.
@@ -16,6 +16,7 @@
 mod belief;
 mod estimate;
 mod heading;
+mod large;
 mod likelihood;
 mod localizer;
 mod motion;
@@ -26,8 +27,8 @@ mod tracker;
 
 pub use belief::Mode;
 pub use estimate::{most_likely_cell, refined_m};
-pub use likelihood::FieldOnCells;
-pub use localizer::{Localizer, Stage, Timings};
+pub use likelihood::{FieldOnCells, MapFields, log_likelihood_nowhere};
+pub use localizer::{FIELDS_IN_MEMORY_BYTES, FrameError, Localizer, LocalizerError, Stage, Timings};
 pub use motion::{ConstantVelocity, Motion, MotionModel, MotionSettings};
 pub use smoother::{Smoothed, smooth};
 pub use tracker::{Observation, Tracked, Tracker};

@@ -97,6 +97,11 @@ impl News {
         Worth { share, reach }
     }
 
+    /// The next frame is the first.
+    pub fn forget(&mut self) {
+        self.reference.clear();
+    }
+
     fn look_at(&mut self, stamp_ns: u64, features: &[f32]) {
         self.reference.clear();
         self.reference.extend_from_slice(features);

@@ -61,6 +61,10 @@ impl StateMachine {
         }
     }
 
+    pub fn start_again(&mut self) {
+        *self = Self::new(self.least_resemblance);
+    }
+
     pub fn state(&self) -> LocalizationState {
         self.state
     }

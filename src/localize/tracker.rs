@@ -5,7 +5,7 @@ use super::motion::{ConstantVelocity, Motion, MotionModel, MotionSettings};
 use super::news::{News, Reach, Worth};
 use super::state::{Evidence, StateMachine};
 use crate::localize::{most_likely_cell, refined_m};
-use crate::map::{CandidateCells, Compass, FeatureMap};
+use crate::map::{CandidateCells, Compass, FeatureMap, MapInfo};
 use crate::types::{
     EstimateWarnings, EstimatedHeading, EstimatedPose, LocalizationState, NS_PER_S, PositionCovariance,
     PositionEstimate, PositionM, distance_m,
@@ -83,35 +83,85 @@ pub struct Tracked {
 
 impl Tracker {
     pub fn new(map: &FeatureMap, settings: MotionSettings) -> Self {
-        Self::with_motion(map, Box::new(ConstantVelocity::new(settings)))
+        Self::on_cells(&map.info, &map.cells, map.compass.clone(), settings)
     }
 
-    /// With another model of the motion, such as one of odometry.
-    pub fn with_motion(map: &FeatureMap, motion: Box<dyn MotionModel>) -> Self {
+    /// On these cells, and with this compass, of a map.
+    pub fn on_cells(
+        info: &MapInfo,
+        cells: &CandidateCells,
+        compass: Option<Compass>,
+        settings: MotionSettings,
+    ) -> Self {
         Self {
-            cells: map.cells.clone(),
-            refine: map.info.refine,
-            temperature: map.info.temperature,
-            map_variance_m2: map.info.position_std_m().powi(2),
-            compass: map.compass.clone(),
-            belief: Belief::uniform(&map.cells),
-            motion,
-            states: StateMachine::new(map.info.least_resemblance),
+            cells: cells.clone(),
+            refine: info.refine,
+            temperature: info.temperature,
+            map_variance_m2: info.position_std_m().powi(2),
+            compass,
+            belief: Belief::uniform(cells),
+            motion: Box::new(ConstantVelocity::new(settings)),
+            states: StateMachine::new(info.least_resemblance),
             last_stamp_ns: None,
             last_used_ns: None,
             usual_interval_s: None,
-            news: News::new(&map.info),
+            news: News::new(info),
             wandered_m2: 0.0,
             last_share: 1.0,
             doubt: 0.0,
         }
     }
 
+    /// With another model of the motion, such as one of odometry.
+    pub fn with_motion(self, motion: Box<dyn MotionModel>) -> Self {
+        Self { motion, ..self }
+    }
+
+    /// Goes on with other cells of the same map.
+    pub(super) fn look_at(&mut self, cells: &CandidateCells) {
+        self.belief = self.belief.on(cells);
+        self.belief.doubt(DOUBT);
+        self.cells = cells.clone();
+    }
+
+    /// Goes on with another part of the map's compass.
+    pub(super) fn turn_by(&mut self, compass: Option<Compass>) {
+        self.compass = compass;
+    }
+
+    /// As if nothing had been seen before.
+    pub fn start_again(&mut self) {
+        self.belief.forget();
+        self.motion.observe(None);
+        self.states.start_again();
+        self.news.forget();
+        (self.last_stamp_ns, self.last_used_ns, self.usual_interval_s) = (None, None, None);
+        (self.wandered_m2, self.last_share, self.doubt) = (0.0, 1.0, 0.0);
+    }
+
+    /// Where the vehicle was after the last frame.
+    pub(super) fn hill(&self) -> Mode {
+        self.belief.mode()
+    }
+
+    pub(super) fn speed_mps(&self) -> Option<f64> {
+        self.motion.velocity_mps().map(|[east, north]| libm::hypot(east, north))
+    }
+
+    pub(super) fn state(&self) -> LocalizationState {
+        self.states.state()
+    }
+
+    /// Seconds since the last frame.
+    pub(super) fn since_last_s(&self, stamp_ns: u64) -> f64 {
+        self.last_stamp_ns.map_or(0.0, |last| seconds(last, stamp_ns))
+    }
+
     /// A frame that could not be used: only time has passed.
     pub fn skip(&mut self, sequence: u32, stamp_ns: u64) -> PositionEstimate {
         self.advance(stamp_ns, None);
         let mode = self.belief.mode();
-        let state = self.states.state();
+        let state = self.state();
         let pose = (state == LocalizationState::Localized).then(|| self.pose(&mode, &[]));
         let warnings = EstimateWarnings { bad_frame: true, ..EstimateWarnings::default() };
         PositionEstimate { sequence, stamp_ns, state, pose, single_frame_m: None, warnings }
@@ -159,7 +209,7 @@ impl Tracker {
 
     /// Moves the belief to the time of a frame, before what that frame says; within `reach`, if pictures show one.
     pub(super) fn advance(&mut self, stamp_ns: u64, reach: Option<Reach>) {
-        let dt_s = self.last_stamp_ns.map_or(0.0, |last| seconds(last, stamp_ns));
+        let dt_s = self.since_last_s(stamp_ns);
         self.last_stamp_ns = Some(stamp_ns);
         if dt_s > 0.0 {
             let motion = self.motion_within(dt_s, reach);

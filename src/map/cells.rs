@@ -1,5 +1,7 @@
 //! Candidate cells: where the vehicle may be.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use crate::types::{PositionM, distance_m};
@@ -92,6 +94,24 @@ impl CandidateCells {
         Ok(Self { grid, cells })
     }
 
+    /// The candidates in a part of the grid, on a grid of their own.
+    ///
+    /// # Panics
+    /// When there are none, or the part lies outside the grid.
+    pub fn within(&self, columns: Range<u32>, rows: Range<u32>) -> Self {
+        assert!(columns.end <= self.grid.columns && rows.end <= self.grid.rows, "a part of the grid");
+        let grid = Grid {
+            origin_m: self.grid.center_m([columns.start, rows.start]),
+            columns: columns.end - columns.start,
+            rows: rows.end - rows.start,
+            ..self.grid
+        };
+        let inside = self.cells.iter().filter(|[i, j]| columns.contains(i) && rows.contains(j));
+        let cells: Vec<[u32; 2]> = inside.map(|[i, j]| [i - columns.start, j - rows.start]).collect();
+        assert!(!cells.is_empty(), "no candidates");
+        Self { grid, cells }
+    }
+
     pub fn len(&self) -> usize {
         self.cells.len()
     }
@@ -155,6 +175,15 @@ mod tests {
         assert_eq!(cells.len(), 2 * 4);
         assert_eq!(cells.index_of([5, 5]), None);
         assert_eq!(cells.index_of([1, 1]).map(|index| cells.center_m(index)), Some([1.0, 1.0]));
+    }
+
+    #[test]
+    fn a_part_keeps_its_places() {
+        let cells = CandidateCells::around(&[[0.0, 0.0], [10.0, 10.0]], 0.5, Some(2.0)).expect("a small grid");
+        let part = cells.within(14..21, 16..20);
+        let inside = |p: &&PositionM| (7.0..=10.0).contains(&p[0]) && (8.0..=9.5).contains(&p[1]);
+        assert_eq!(part.centers_m(), cells.centers_m().iter().filter(inside).copied().collect::<Vec<_>>());
+        assert!(part.len() > 4 && part.index_of([6, 3]).is_some());
     }
 
     #[test]

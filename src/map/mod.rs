@@ -7,6 +7,7 @@
 // The same estimates on every computer.
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))]
 
+mod blocks;
 mod cells;
 mod compass;
 pub mod file;
@@ -16,9 +17,10 @@ mod track;
 use faer::Mat;
 use serde::{Deserialize, Serialize};
 
+pub use blocks::{BLOCK_SIDE, Block};
 pub use cells::{CandidateCells, CellsError, Grid};
 pub use compass::Compass;
-pub use file::{FORMAT_VERSION, MapError};
+pub use file::{FORMAT_VERSION, GroupField, MapError, OpenMap};
 pub use recipe::{
     GroupHyperparameters, GroupRecipe, Model, NoiseModel, NoiseWhiteningSettings, PERTURBED_COPIES, Recipe, RecipeName,
     Selection, SplitKind,

@@ -16,7 +16,7 @@ use super::survey::Survey;
 use super::temperature::fit_temperature;
 use crate::gp::fit::Warning;
 use crate::gp::{GpError, LearningPositions};
-use crate::localize::{FieldOnCells, most_likely_cell, refined_m};
+use crate::localize::{FieldOnCells, log_likelihood_nowhere, most_likely_cell, refined_m};
 use crate::map::{CandidateCells, CellsError, NoiseModel, Recipe, Selection};
 use crate::metrics::component_median;
 use crate::types::PositionM;
@@ -210,7 +210,7 @@ fn run_once(
             warnings: group.hyperparameters.warnings(),
         });
         let weight = group_recipe.weight as f32;
-        let of_group = queries.nowhere(&kept_group, &kept_field, &split.validation);
+        let of_group = queries.nowhere(&kept_group, &split.validation);
         nowhere = nowhere.zip(of_group).map(|(sums, of_group): (Vec<f32>, _)| {
             sums.iter().zip(of_group).map(|(sum, value)| sum + weight * value).collect()
         });
@@ -302,9 +302,9 @@ impl Queries<'_> {
     }
 
     /// Log-likelihoods of no place.
-    fn nowhere(&self, group: &LearnedGroup, field: &FieldOnCells, rows: &[usize]) -> Option<Vec<f32>> {
+    fn nowhere(&self, group: &LearnedGroup, rows: &[usize]) -> Option<Vec<f32>> {
         let features = self.features(group, rows);
-        features.iter().map(|features| field.log_likelihood_nowhere(features, group.recipe.noise)).collect()
+        features.iter().map(|features| log_likelihood_nowhere(features, group.recipe.noise)).collect()
     }
 
     /// Features of the frames at `rows`, one vector a frame.

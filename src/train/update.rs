@@ -14,9 +14,10 @@ use super::track::TrackSmoother;
 use super::trial::locate;
 use super::{NEAR_SPACINGS, compass_of};
 use crate::gp::{GpError, LearningPositions};
-use crate::localize::FieldOnCells;
+use crate::localize::MapFields;
 use crate::map::{
-    CandidateCells, CellsError, Compass, FeatureMap, GroupInfo, MapGroup, MapInfo, Smoothing, TrackReport, TrainedOn,
+    CandidateCells, CellsError, Compass, FeatureMap, GroupField, GroupInfo, MapGroup, MapInfo, Smoothing, TrackReport,
+    TrainedOn,
 };
 use crate::metrics::{ErrorFigures, component_median};
 use crate::types::PositionM;
@@ -107,8 +108,8 @@ pub fn update(
     };
     let (tests, rest): (Vec<usize>, Vec<usize>) = (0..joined.positions_m.len()).partition(|&row| is_held_back(row));
     let known: Vec<usize> = rest.iter().copied().filter(|&row| row < joined.of_map).collect();
-    let before = joined.log_likelihoods(&known, &tests, &cells)?;
-    let after = joined.log_likelihoods(&rest, &tests, &cells)?;
+    let before = joined.log_likelihoods(&map.info.groups, &known, &tests, &cells)?;
+    let after = joined.log_likelihoods(&map.info.groups, &rest, &tests, &cells)?;
     let compare = |is_wanted: &dyn Fn(usize) -> bool| {
         let wanted: Vec<usize> = (0..tests.len()).filter(|&i| is_wanted(tests[i])).collect();
         let truth_m: Vec<PositionM> = wanted.iter().map(|&i| joined.positions_m[tests[i]]).collect();
@@ -221,25 +222,29 @@ impl Joined {
     /// Summed log-likelihoods of the frames `queries` at every cell, learned from `rows`: query by query.
     fn log_likelihoods(
         &self,
+        infos: &[GroupInfo],
         rows: &[usize],
         queries: &[usize],
         cells: &CandidateCells,
     ) -> Result<Vec<Vec<f32>>, UpdateError> {
         let (learning, centers_m) = (self.learning(rows), cells.centers_m());
-        let fields: Vec<FieldOnCells> = self
+        let fields: Vec<GroupField> = self
             .groups
             .iter()
-            .map(|group| group.of_rows(rows).on_cells(&learning, &centers_m))
-            .collect::<Result<_, _>>()?;
+            .map(|group| {
+                let (mean, variance) = group.of_rows(rows).predict(&learning, &centers_m)?;
+                Ok(GroupField { mean, variance })
+            })
+            .collect::<Result<_, UpdateError>>()?;
+        let fields = MapFields::new(infos, cells.len(), fields);
+        let features_of = |query: usize| self.groups.iter().flat_map(move |group| group.learning.row(query).iter());
         Ok(queries
             .par_iter()
             .map_init(Vec::new, |scratch, &query| {
-                let mut sum = vec![0.0; cells.len()];
-                for (group, field) in self.groups.iter().zip(&fields) {
-                    let z: Vec<f32> = (0..group.features()).map(|r| group.learning[(query, r)] as f32).collect();
-                    field.add_log_likelihood(&z, group.recipe.noise, group.recipe.weight as f32, scratch, &mut sum);
-                }
-                sum
+                let features: Vec<f32> = features_of(query).map(|&z| z as f32).collect();
+                let mut log_likelihood = vec![0.0; cells.len()];
+                fields.add_log_likelihood(&features, scratch, &mut log_likelihood);
+                log_likelihood
             })
             .collect())
     }

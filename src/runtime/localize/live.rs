@@ -19,13 +19,13 @@ use tracing::{info, warn};
 
 use super::{
     newest::Newest,
-    session::{Counts, LensError, Session},
+    session::{Counts, Session, SessionError},
 };
 use crate::{
     config::{Camera, LocalizeConfig},
     devices::{CameraEvent, Stop},
     localize::Timings,
-    map::{FeatureMap, file},
+    map::OpenMap,
     outputs::{OutputReport, Outputs},
     recording::recorder::{Encoder, Head, Recorder, RecorderHandle, RecorderReport},
     runtime::{
@@ -72,17 +72,17 @@ struct Shared {
     last: Option<PositionEstimate>,
     timings: Timings,
     /// Why it has ended before it was told to.
-    error: Option<LensError>,
+    error: Option<SessionError>,
 }
 
 /// Localizes as `config` says, until it is told to stop or the camera ends as a replay does; `each_second` is told the
 /// status.
 pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus)) -> anyhow::Result<LocalizeReport> {
-    let map = read_map(&config.map.file)?;
+    let map = open_map(&config.map.file)?;
     let watched = MapWatch::new(&config.map.file);
     let outputs = Outputs::start(&config.outputs, map.info.origin)?;
     let calibration = drive::calibration_json(&map.info.calibration);
-    let session = Session::new(map, config.motion).with_context(|| config.map.file.display().to_string())?;
+    let session = start_session(map, config)?;
     let simulated = config.simulation.as_ref().map(drive::simulate);
     let simulation = simulated.as_ref().map(|(simulation, world)| (simulation.clone(), world));
     // A camera renders its world first, which takes a while: the clocks start when it is ready.
@@ -128,11 +128,17 @@ pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus
     }
 }
 
-/// Reads a map.
-pub fn read_map(path: &Path) -> anyhow::Result<FeatureMap> {
+/// Opens a map, without reading more of it than it says of the whole.
+pub fn open_map(path: &Path) -> anyhow::Result<OpenMap> {
     let context = || format!("loading the map {}", path.display());
-    let reader = fs::File::open(path).with_context(context)?;
-    file::read(reader).with_context(context)
+    let file = fs::File::open(path).with_context(context)?;
+    OpenMap::open(Box::new(file)).with_context(context)
+}
+
+/// What localizes on `map`, as `config` says.
+pub fn start_session(map: OpenMap, config: &LocalizeConfig) -> anyhow::Result<Session> {
+    Session::new(map, config.motion, config.map.memory_bytes())
+        .with_context(|| format!("loading the map {}", config.map.file.display()))
 }
 
 fn start_camera(

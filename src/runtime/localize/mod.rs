@@ -15,4 +15,4 @@ pub mod playback;
 pub mod session;
 
 pub use live::{LocalizeReport, LocalizeStatus};
-pub use session::{Counts, LensError, Session};
+pub use session::{Counts, Session, SessionError};

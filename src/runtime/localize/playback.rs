@@ -1,6 +1,6 @@
 //! A recorded drive localized as fast as it goes: one order, no clock, the same estimates every time.
 
-use super::session::{LensError, Session};
+use super::session::{Session, SessionError};
 use crate::{
     devices::replay::Damages,
     recording::{RecordingError, TimedRecord},
@@ -12,7 +12,7 @@ pub enum PlaybackError {
     #[error(transparent)]
     Recording(#[from] RecordingError),
     #[error(transparent)]
-    Lens(#[from] LensError),
+    Session(#[from] SessionError),
     #[error("cannot write the estimates")]
     Output(#[from] std::io::Error),
 }

@@ -5,9 +5,9 @@ use tracing::{info, warn};
 use super::lens_check::{LensCheck, LensVerdict};
 use crate::{
     devices::{CameraEvent, CameraFrame},
-    localize::{Localizer, MotionSettings, Timings},
-    map::FeatureMap,
-    types::{DonutCalibration, EstimateWarnings, LocalizationState, PositionEstimate},
+    localize::{FrameError, Localizer, LocalizerError, MotionSettings, Timings},
+    map::{MapError, OpenMap},
+    types::{CalibrationError, DonutCalibration, EstimateWarnings, LocalizationState, PositionEstimate},
 };
 
 /// Localizes on one map, and keeps count.
@@ -16,8 +16,6 @@ pub struct Session {
     /// Where the localizer takes the donut to be.
     calibration: DonutCalibration,
     lens_check: Option<LensCheck>,
-    map: FeatureMap,
-    settings: MotionSettings,
     counts: Counts,
     last: Option<PositionEstimate>,
 }
@@ -34,23 +32,24 @@ pub struct Counts {
 }
 
 #[derive(Debug, thiserror::Error)]
-pub enum LensError {
+pub enum SessionError {
     #[error("the map is of another lens: {what}; train a map with this lens, or mount the one of the map")]
     Other { what: String },
     #[error("the lens cannot be where it is found")]
-    Calibration(#[from] crate::types::CalibrationError),
+    Calibration(#[from] CalibrationError),
+    #[error("the map cannot be read any more")]
+    Map(#[from] MapError),
 }
 
 impl Session {
     /// # Errors
-    /// When the map's donut does not lie within its images.
-    pub fn new(map: FeatureMap, settings: MotionSettings) -> Result<Self, LensError> {
+    /// When the map's donut does not lie within its images, or the map cannot be read.
+    pub fn new(map: OpenMap, settings: MotionSettings, memory_bytes: usize) -> Result<Self, LocalizerError> {
+        let calibration = map.info.calibration.clone();
         Ok(Self {
-            localizer: Localizer::new(&map, &map.info.calibration, settings)?,
-            calibration: map.info.calibration.clone(),
-            lens_check: Some(LensCheck::new(&map.info.calibration)),
-            map,
-            settings,
+            localizer: Localizer::new(map, settings, memory_bytes)?,
+            lens_check: Some(LensCheck::new(&calibration)),
+            calibration,
             counts: Counts::default(),
             last: None,
         })
@@ -59,13 +58,13 @@ impl Session {
     /// What the camera says; `Some` estimate after a frame.
     ///
     /// # Errors
-    /// When the camera looks through another lens than the map's.
-    pub fn take(&mut self, event: &CameraEvent) -> Result<Option<PositionEstimate>, LensError> {
+    /// When the camera looks through another lens than the map's, or the map cannot be read any more.
+    pub fn take(&mut self, event: &CameraEvent) -> Result<Option<PositionEstimate>, SessionError> {
         match event {
             CameraEvent::Opened(facts) => {
                 info!(camera = facts.name, width_px = facts.width_px, height_px = facts.height_px, "camera open");
                 // Whoever unplugged the camera may have turned the lens.
-                self.lens_check = Some(LensCheck::new(&self.map.info.calibration));
+                self.lens_check = Some(LensCheck::new(&self.localizer.map_info().calibration));
                 Ok(None)
             }
             CameraEvent::Lost(lost) => {
@@ -76,7 +75,7 @@ impl Session {
         }
     }
 
-    fn frame(&mut self, frame: &CameraFrame) -> Result<PositionEstimate, LensError> {
+    fn frame(&mut self, frame: &CameraFrame) -> Result<PositionEstimate, SessionError> {
         if frame.damage.is_none() {
             self.check_lens(&frame.jpeg)?;
         }
@@ -85,7 +84,8 @@ impl Session {
             Some(_) => Err(self.localizer.skip(sequence, stamp_ns)),
             None => match self.localizer.take(sequence, stamp_ns, &frame.jpeg) {
                 Ok(tracked) => Ok(tracked.estimate),
-                Err(_) => Err(self.localizer.skip(sequence, stamp_ns)),
+                Err(FrameError::Jpeg(_)) => Err(self.localizer.skip(sequence, stamp_ns)),
+                Err(FrameError::Map(error)) => return Err(error.into()),
             },
         };
         self.counts.frames += 1;
@@ -97,11 +97,11 @@ impl Session {
         Ok(estimate)
     }
 
-    fn check_lens(&mut self, jpeg: &[u8]) -> Result<(), LensError> {
+    fn check_lens(&mut self, jpeg: &[u8]) -> Result<(), SessionError> {
         let Some(verdict) = self.lens_check.as_mut().and_then(|check| check.look(jpeg)) else { return Ok(()) };
         self.lens_check = None;
         match verdict {
-            LensVerdict::Fits => self.look_through(self.map.info.calibration.clone()),
+            LensVerdict::Fits => self.look_through(self.localizer.map_info().calibration.clone()),
             LensVerdict::Slipped { by_px: [x_px, y_px], calibration } => {
                 warn!(x_px, y_px, "the lens has slipped since the survey: the panorama is cut out where it is now");
                 self.look_through(calibration)
@@ -110,14 +110,14 @@ impl Session {
                 warn!(reason, "the lens could not be checked; going on as before");
                 Ok(())
             }
-            LensVerdict::Other(what) => Err(LensError::Other { what }),
+            LensVerdict::Other(what) => Err(SessionError::Other { what }),
         }
     }
 
     /// Goes on with the donut where it is; from the beginning if that is elsewhere than before.
-    fn look_through(&mut self, calibration: DonutCalibration) -> Result<(), LensError> {
+    fn look_through(&mut self, calibration: DonutCalibration) -> Result<(), SessionError> {
         if calibration != self.calibration {
-            self.localizer = Localizer::new(&self.map, &calibration, self.settings)?;
+            self.localizer.look_through(&calibration)?;
             self.calibration = calibration;
         }
         Ok(())
