@@ -41,7 +41,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(DONE.into());
     }
     journal::start();
-    let outcome = live::localize(&config, |status| journal::show_status(&line(status)));
+    let outcome = live::localize(&config, |status| journal::show_status(line(status)));
     journal::finish();
     finish(&outcome?, args.timings)
 }

@@ -37,7 +37,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(DONE.into());
     }
     journal::start();
-    let outcome = drive::record(&config, |status| journal::show_status(&line(status)));
+    let outcome = drive::record(&config, |status| journal::show_status(line(status)));
     journal::finish();
     finish(&outcome?)
 }

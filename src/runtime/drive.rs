@@ -37,8 +37,12 @@ pub const SIMULATED_START: ClockReading =
 const SIMULATED_LEAD_S: f64 = 0.5;
 const LONGEST_LEAD_S: f64 = 2.0;
 
-/// Records a drive as `config` says, until it is told to stop or its devices end; `each_second` is told the status.
-pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) -> anyhow::Result<DriveReport> {
+/// Records a drive as `config` says, until it is told to stop or its devices end; `each_second` is told the status and
+/// says it in a line.
+pub fn record(
+    config: &RecordConfig,
+    each_second: impl FnMut(&omniloc::Status) -> String,
+) -> anyhow::Result<DriveReport> {
     let simulated = config.simulation.as_ref().map(simulate);
     let start = match (&config.simulation, replayed(config)) {
         (Some(_), _) => Some(SIMULATED_START),
