@@ -27,5 +27,5 @@ mod signals;
 mod status;
 mod supervisor;
 pub mod survey;
-mod system;
+pub mod system;
 mod turn_watch;
