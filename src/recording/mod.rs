@@ -4,6 +4,9 @@
 //! linked by the frame's sequence number. Positions are metres east and north from the recording's origin; where that
 //! origin lies on the Earth may be unknown.
 
+// The same estimates on every computer.
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))]
+
 mod atomic;
 mod dataset;
 mod error;

@@ -192,13 +192,13 @@ pub(super) fn pose_message(
     [east_m, north_m]: PositionM,
     yaw_rad: Option<f64>,
 ) -> foxglove::PoseInFrame {
-    let half_yaw_rad = yaw_rad.unwrap_or(0.0) / 2.0;
+    let (z, w) = libm::sincos(yaw_rad.unwrap_or(0.0) / 2.0);
     foxglove::PoseInFrame {
         timestamp: Some(timestamp),
         frame_id: topics::MAP_FRAME.into(),
         pose: Some(foxglove::Pose {
             position: Some(foxglove::Vector3 { x: east_m, y: north_m, z: 0.0 }),
-            orientation: Some(foxglove::Quaternion { x: 0.0, y: 0.0, z: half_yaw_rad.sin(), w: half_yaw_rad.cos() }),
+            orientation: Some(foxglove::Quaternion { x: 0.0, y: 0.0, z, w }),
         }),
     }
 }

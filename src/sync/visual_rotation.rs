@@ -79,13 +79,14 @@ pub struct VisualRotation {
 /// the shift and taken off it, see `without_parallax_rad`.
 pub struct RotationTracker {
     azimuth: AzimuthSense,
-    forward: Arc<dyn RealToComplex<f64>>,
-    inverse: Arc<dyn ComplexToReal<f64>>,
-    ring: Vec<f64>,
+    // In f32, whose twiddle factors are the same on every computer.
+    forward: Arc<dyn RealToComplex<f32>>,
+    inverse: Arc<dyn ComplexToReal<f32>>,
+    ring: Vec<f32>,
     cross: Vec<Complex<f64>>,
-    spectrum: Vec<Complex<f64>>,
-    correlation: Vec<f64>,
-    scratch: Vec<Complex<f64>>,
+    spectrum: Vec<Complex<f32>>,
+    correlation: Vec<f32>,
+    scratch: Vec<Complex<f32>>,
     /// What columns count, and the scale of a transform forth and back.
     along: Vec<f64>,
     /// How much parallax shifts them.
@@ -119,7 +120,7 @@ impl RotationTracker {
         Self {
             azimuth,
             ring: forward.make_input_vec(),
-            cross: inverse.make_input_vec(),
+            cross: vec![Complex::ZERO; HARMONICS],
             spectrum: forward.make_output_vec(),
             correlation: inverse.make_output_vec(),
             scratch: vec![Complex::ZERO; scratch_length],
@@ -175,22 +176,23 @@ impl RotationTracker {
         for (rows, ((spectrum, along), energy)) in rings.zip(spectra.zip(&mut profile.energies)) {
             self.ring.fill(0.0);
             for row in rows.chunks_exact(WIDE_COLUMNS) {
-                self.ring.iter_mut().zip(row).for_each(|(sum, &value)| *sum += f64::from(value));
+                // Around mid-gray: the mean is not used, and small numbers keep their digits.
+                self.ring.iter_mut().zip(row).for_each(|(sum, &value)| *sum += value - 128.0);
             }
             self.forward
                 .process_with_scratch(&mut self.ring, &mut self.spectrum, &mut self.scratch)
                 .expect("the buffers come from the plan");
-            spectrum.copy_from_slice(&self.spectrum[USED]);
+            spectrum.iter_mut().zip(&self.spectrum[USED]).for_each(|(to, from)| *to = wide(from));
             self.spectrum[..USED.start].fill(Complex::ZERO);
             self.spectrum[USED.end..].fill(Complex::ZERO);
             self.inverse
                 .process_with_scratch(&mut self.spectrum, &mut self.ring, &mut self.scratch)
                 .expect("the buffers come from the plan");
-            self.ring.iter_mut().zip(&self.along).for_each(|(value, factor)| *value *= factor);
+            self.ring.iter_mut().zip(&self.along).for_each(|(value, factor)| *value *= *factor as f32);
             self.forward
                 .process_with_scratch(&mut self.ring, &mut self.spectrum, &mut self.scratch)
                 .expect("the buffers come from the plan");
-            along.copy_from_slice(&self.spectrum[USED]);
+            along.iter_mut().zip(&self.spectrum[USED]).for_each(|(to, from)| *to = wide(from));
             *energy = along.iter().zip(&*spectrum).map(|(a, b)| (a.conj() * b).re).sum();
         }
     }
@@ -210,7 +212,7 @@ impl RotationTracker {
             used.iter_mut().zip(products(from, to, ring)).for_each(|(sum, product)| *sum += product * factor);
         }
         let mut spectrum = std::mem::take(&mut self.spectrum);
-        spectrum.copy_from_slice(&self.cross);
+        spectrum.iter_mut().zip(&self.cross).for_each(|(to, from)| *to = narrow(from));
         self.inverse
             .process_with_scratch(&mut spectrum, &mut self.correlation, &mut self.scratch)
             .expect("the buffers come from the plan");
@@ -222,7 +224,8 @@ impl RotationTracker {
             apart.min(WIDE_COLUMNS - apart)
         };
         let elsewhere = self.correlation.iter().enumerate().filter(|(other, _)| apart(*other) > PEAK_COLUMNS);
-        let rival = elsewhere.map(|(_, &value)| value).fold(0.0, f64::max);
+        let rival = f64::from(elsewhere.map(|(_, &value)| value).fold(0.0, f32::max));
+        let peak = f64::from(peak);
         // The inverse transform counts each harmonic for itself and its conjugate.
         let quality = peak / 2.0;
         if quality < MIN_QUALITY || peak < MIN_LEAD * rival {
@@ -245,8 +248,8 @@ impl RotationTracker {
         if shift_rad.abs() < LEARNING_SHIFT_RAD {
             return;
         }
-        let step = Complex::from_polar(1.0, shift_rad);
-        let first = Complex::from_polar(1.0, shift_rad * USED.start as f64);
+        let step = from_polar(1.0, shift_rad);
+        let first = from_polar(1.0, shift_rad * USED.start as f64);
         for ring in 0..RINGS {
             let scale = (from.energies[ring] * to.energies[ring]).sqrt();
             let mut turn = first;
@@ -317,18 +320,19 @@ impl RotationTracker {
     /// A ring's values and slopes, with its columns moved by `shift_rad`, to `columns[2 * place..]`.
     fn fill_columns(&mut self, profile: &Profile, ring: usize, shift_rad: f64, place: usize) {
         let harmonics = &profile.spectra[ring * USED.len()..(ring + 1) * USED.len()];
-        let step = Complex::from_polar(1.0, shift_rad);
+        let step = from_polar(1.0, shift_rad);
         for (is_slope, columns) in self.columns[2 * place..2 * place + 2].iter_mut().enumerate() {
-            self.cross.fill(Complex::ZERO);
-            let mut turn = Complex::from_polar(1.0 / WIDE_COLUMNS as f64, shift_rad * USED.start as f64);
-            for (k, (value, harmonic)) in USED.zip(self.cross[USED].iter_mut().zip(harmonics)) {
+            self.spectrum.fill(Complex::ZERO);
+            let mut turn = from_polar(1.0 / WIDE_COLUMNS as f64, shift_rad * USED.start as f64);
+            for (k, (value, harmonic)) in USED.zip(self.spectrum[USED].iter_mut().zip(harmonics)) {
                 let factor = if is_slope == 1 { Complex::new(0.0, k as f64) } else { Complex::new(1.0, 0.0) };
-                *value = harmonic * turn * factor;
+                *value = narrow(&(harmonic * turn * factor));
                 turn *= step;
             }
             self.inverse
-                .process_with_scratch(&mut self.cross, columns, &mut self.scratch)
+                .process_with_scratch(&mut self.spectrum, &mut self.correlation, &mut self.scratch)
                 .expect("the buffers come from the plan");
+            columns.iter_mut().zip(&self.correlation).for_each(|(to, &from)| *to = from.into());
         }
     }
 
@@ -338,8 +342,8 @@ impl RotationTracker {
         let mut shift_rad = start_rad;
         for _ in 0..NEWTON_STEPS {
             let (mut slope, mut bend) = (0.0, 0.0);
-            let step = Complex::from_polar(1.0, shift_rad);
-            let mut turn = Complex::from_polar(1.0, shift_rad * USED.start as f64);
+            let step = from_polar(1.0, shift_rad);
+            let mut turn = from_polar(1.0, shift_rad * USED.start as f64);
             for (k, cross) in USED.zip(&self.cross[USED]) {
                 let (k, value) = (k as f64, cross * turn);
                 slope -= k * value.im;
@@ -353,6 +357,19 @@ impl RotationTracker {
         }
         if shift_rad > PI { shift_rad - TAU } else { shift_rad }
     }
+}
+
+fn from_polar(radius: f64, angle_rad: f64) -> Complex<f64> {
+    let (sin, cos) = libm::sincos(angle_rad);
+    Complex::new(radius * cos, radius * sin)
+}
+
+fn wide(value: &Complex<f32>) -> Complex<f64> {
+    Complex::new(value.re.into(), value.im.into())
+}
+
+fn narrow(value: &Complex<f64>) -> Complex<f32> {
+    Complex::new(value.re as f32, value.im as f32)
 }
 
 /// ½ (A′* B + A* B′) of one ring, for each harmonic.
