@@ -135,9 +135,9 @@ mod tests {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let file = folder.path().join("file");
         std::fs::write(&file, "no folder").expect("writes");
-        let findings = examine(&Settings::new(&file.join("recordings")), None);
+        let findings = examine(&Settings::new(file.join("recordings")), None);
         assert_eq!((findings.len(), findings[0].verdict), (1, Verdict::Problem));
-        let findings = examine(&Settings::new(&folder.path().join("recordings")), Some(1e5));
+        let findings = examine(&Settings::new(folder.path().join("recordings")), Some(1e5));
         assert_eq!(findings.iter().map(|finding| finding.check).collect::<Vec<_>>(), ["disk", "disk writes"]);
     }
 }
