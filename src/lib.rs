@@ -33,6 +33,7 @@
 //! | [`evaluate`] | the protocol's results and the paper's tables |
 //! | [`world`] | simulated places, drives and receivers |
 //! | [`config`] | one TOML file → the settings that the modules own |
+//! | [`doctor`] | what is wrong with devices and computer, and what to do |
 //! | [`runtime`] | which task feeds which; keeps devices running; starts and stops |
 //! | [`commands`] | the program: one file a command |
 //!
@@ -47,6 +48,7 @@ pub mod calibrate;
 pub mod commands;
 pub mod config;
 pub mod devices;
+pub mod doctor;
 pub mod evaluate;
 pub mod features;
 pub mod gnss;

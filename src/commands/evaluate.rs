@@ -157,6 +157,9 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
 fn in_words(entries: &[Entry]) -> String {
     let mut text = String::new();
     for entry in entries {
+        if entry.coverage_95.is_none() && entry.estimator == "filtered" {
+            text += "filtered: not sure of the position in any frame, so there are no errors to speak of\n";
+        }
         let Some(covered) = entry.coverage_95 else { continue };
         text += &format!(
             "{}: the region of 95 % holds the true position in {:.1} % of the frames",

@@ -80,16 +80,17 @@ pub fn start() {
     };
 }
 
-/// Replaces the status line. Elsewhere than on a terminal there is none.
-pub fn show_status(text: &str) {
+/// Replaces the status line, and hands it back. Elsewhere than on a terminal there is none.
+pub fn show_status(text: String) -> String {
     if io::stderr().is_terminal() {
-        send(Line::Status(text.to_owned()));
+        send(Line::Status(text.clone()));
     }
+    text
 }
 
 /// Takes the status line away and waits a moment for what is queued.
 pub fn finish() {
-    show_status("");
+    show_status(String::new());
     let (done, written) = mpsc::sync_channel(1);
     send(Line::Flush(done));
     let _ = written.recv_timeout(LAST_LINES);

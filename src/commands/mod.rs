@@ -4,6 +4,7 @@ pub mod calibrate;
 pub mod check;
 pub mod completions;
 pub mod demo;
+pub mod doctor;
 pub mod evaluate;
 pub mod export;
 pub mod file_kind;
@@ -67,6 +68,7 @@ pub enum Command {
     Check(check::Args),
     Recover(recover::Args),
     Mark(mark::Args),
+    Doctor(doctor::Args),
     Completions(completions::Args),
     Man(man::Args),
 }
@@ -88,6 +90,7 @@ impl Command {
             Self::Check(args) => check::run(args),
             Self::Recover(args) => recover::run(args),
             Self::Mark(args) => mark::run(args),
+            Self::Doctor(args) => doctor::run(args),
             Self::Completions(args) => completions::run(args, Cli::command()),
             Self::Man(args) => man::run(args, Cli::command()),
         }

@@ -4,7 +4,7 @@ use std::{path::PathBuf, process::ExitCode};
 
 use super::{BadArgument, DATA_LOST, DONE, chain, journal, print};
 use crate::{
-    config::{Camera, RecordConfig},
+    config::RecordConfig,
     recording::proto::omniloc::Status,
     runtime::drive::{self, DriveReport},
 };
@@ -29,15 +29,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.check {
         print(&config.resolved())?;
     }
-    if matches!(config.camera, Camera::V4l2(_)) && !cfg!(feature = "vehicle") {
-        let what = "this program was built without the camera driver: cargo build --release --features vehicle";
-        return Err(BadArgument(format!("{}: [camera]: driver is \"v4l2\", but {what}", args.config.display())).into());
-    }
+    let wrong = |what| BadArgument(format!("{}: {what}", args.config.display()));
+    config.camera.check_driver().map_err(wrong)?;
     if args.check {
         return Ok(DONE.into());
     }
     journal::start();
-    let outcome = drive::record(&config, |status| journal::show_status(&line(status)));
+    let outcome = drive::record(&config, |status| journal::show_status(line(status)));
     journal::finish();
     finish(&outcome?)
 }

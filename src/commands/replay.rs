@@ -119,7 +119,7 @@ fn record_again(args: &Args) -> anyhow::Result<ExitCode> {
         Speed::Max => as_fast_as_it_goes(args, out, &recording, &config),
         Speed::Times(times) => {
             let config = RecordConfig { replay_speed: times, ..config };
-            let outcome = drive::record(&config, |status| journal::show_status(&record::line(status)));
+            let outcome = drive::record(&config, |status| journal::show_status(record::line(status)));
             journal::finish();
             record::finish(&outcome?)
         }
@@ -139,7 +139,7 @@ fn localize(args: &Args) -> anyhow::Result<ExitCode> {
         Speed::Times(times) => {
             let recorder = args.out.as_deref().map(recorder::Settings::new);
             let config = LocalizeConfig { replay_speed: times, recorder, ..config };
-            let outcome = live::localize(&config, |status| journal::show_status(&localize::line(status)));
+            let outcome = live::localize(&config, |status| journal::show_status(localize::line(status)));
             journal::finish();
             localize::finish(&outcome?, args.timings)
         }

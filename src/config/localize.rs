@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Camera, ConfigError, Fault, Replay, Vehicle, load, read_camera, tables::Tables};
+use super::{Camera, ConfigError, Fault, Replay, Vehicle, load, read_camera, read_simulation, tables::Tables};
 use crate::{
     devices::simulated,
     localize::{FIELDS_IN_MEMORY_BYTES, MotionSettings},
@@ -80,20 +80,15 @@ impl LocalizeConfig {
             outputs: tables.or_empty("outputs").read(outputs::Settings::check)?,
             recorder: tables.optional("recorder").map(|table| table.read(recorder::Settings::check)).transpose()?,
             replay_speed: 1.0,
-            simulation: tables
-                .optional("simulation")
-                .map(|table| table.read(simulated::Settings::check))
-                .transpose()?,
+            simulation: None,
         };
+        let simulation = tables.optional("simulation");
         tables.refuse_others("[vehicle], [camera], [map], [motion], [outputs], [recorder] or [simulation]")?;
-        match (&config.simulation, &config.camera) {
-            (_, Camera::None) => Err(Fault::new(0, "[camera]: driver is \"none\", but localizing needs a camera")),
-            (None, Camera::Simulated) => Err(Fault::new(text.len(), "a simulated driver needs the table [simulation]")),
-            (Some(_), camera) if *camera != Camera::Simulated => {
-                Err(Fault::new(0, "[simulation] is given, but no driver is `simulated`"))
-            }
-            _ => Ok(config),
+        if config.camera == Camera::None {
+            return Err(Fault::new(0, "[camera]: driver is \"none\", but localizing needs a camera"));
         }
+        let is_simulated = config.camera == Camera::Simulated;
+        Ok(Self { simulation: read_simulation(simulation, is_simulated)?, ..config })
     }
 
     fn resolve_paths(&mut self, folder: &Path) {
@@ -136,31 +131,17 @@ mod tests {
     use std::fs;
 
     use super::*;
-
-    fn shipped() -> PathBuf {
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("config/localize.toml")
-    }
+    use crate::config::tests::{shipped, with_defaults};
 
     #[test]
     fn the_shipped_file_loads_and_states_the_true_defaults() {
-        let text = fs::read_to_string(shipped()).expect("readable");
-        let config = LocalizeConfig::load(&shipped()).unwrap_or_else(|error| panic!("{error}"));
+        let text = fs::read_to_string(shipped("localize.toml")).expect("readable");
+        let config = LocalizeConfig::load(&shipped("localize.toml")).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(LocalizeConfig::parse(&config.resolved()).expect("loads again"), config);
-        let is_setting = |line: &str| {
-            let key = line.split_once(" = ").map_or("", |(key, _)| key);
-            !key.is_empty() && key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit())
-        };
-        let uncommented: String = text
-            .lines()
-            .map(|line| match line.strip_prefix("# ") {
-                Some(setting) if is_setting(setting) => format!("{setting}\n"),
-                _ => format!("{line}\n"),
-            })
-            .collect();
-        assert_ne!(uncommented, text, "it explains something");
-        let mut with_defaults = LocalizeConfig::parse(&uncommented).unwrap_or_else(|fault| panic!("{fault:?}"));
-        with_defaults.resolve_paths(shipped().parent().expect("a folder"));
-        assert_eq!(with_defaults.resolved(), config.resolved());
+        let mut defaults =
+            LocalizeConfig::parse(&with_defaults(&text, &[])).unwrap_or_else(|fault| panic!("{fault:?}"));
+        defaults.resolve_paths(&shipped(""));
+        assert_eq!(defaults.resolved(), config.resolved());
     }
 
     const LEAST: &str = "[vehicle]\nname = \"car\"\n[camera]\ndriver = \"replay\"\nrecording = \"a.mcap\"\n[map]\n\

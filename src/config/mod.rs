@@ -21,7 +21,7 @@ pub use self::{
     record::{Gnss, RecordConfig},
     tables::Fault,
 };
-use crate::devices::camera_v4l2;
+use crate::devices::{camera_v4l2, simulated};
 
 /// Larger files are no configurations \[bytes\].
 const MAX_CONFIG_BYTES: u64 = 1 << 20;
@@ -61,6 +61,18 @@ pub struct Replay {
     pub recording: PathBuf,
 }
 
+impl Camera {
+    /// Refuses a driver that this build does not have.
+    pub fn check_driver(&self) -> Result<(), String> {
+        match self {
+            Self::V4l2(_) if !cfg!(feature = "vehicle") => Err("[camera]: driver is \"v4l2\", but this program was \
+                built without the camera driver: cargo build --release --features vehicle"
+                .into()),
+            _ => Ok(()),
+        }
+    }
+}
+
 impl Vehicle {
     fn check(&self) -> Result<(), String> {
         let length = self.name.chars().count();
@@ -95,4 +107,40 @@ fn read_camera(mut table: Table<'_>) -> Result<Camera, Fault> {
         "simulated" => table.read(|Nothing {}| Ok(())).map(|Nothing {}| Camera::Simulated)?,
         _ => table.read(|Nothing {}| Ok(())).map(|Nothing {}| Camera::None)?,
     })
+}
+
+/// The table [simulation], which is there exactly if something is `simulated`.
+fn read_simulation(table: Option<Table<'_>>, is_simulated: bool) -> Result<Option<simulated::Settings>, Fault> {
+    match table.map(|table| table.read(simulated::Settings::check)).transpose()? {
+        None if is_simulated => Err(Fault::new(usize::MAX, "a simulated driver needs the table [simulation]")),
+        Some(_) if !is_simulated => Err(Fault::new(0, "[simulation] is given, but no driver is `simulated`")),
+        simulation => Ok(simulation),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::{Path, PathBuf};
+
+    /// A file of the folder `config/`.
+    pub fn shipped(name: &str) -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(name)
+    }
+
+    /// The text of a shipped file with the defaults that it states as comments, but for keys without one.
+    pub fn with_defaults(text: &str, without_default: &[&str]) -> String {
+        let is_setting = |line: &str| {
+            let key = line.split_once(" = ").map_or("", |(key, _)| key);
+            !key.is_empty()
+                && key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit())
+                && !without_default.contains(&key)
+        };
+        let uncommented = |line: &str| match line.strip_prefix("# ") {
+            Some(setting) if is_setting(setting) => format!("{setting}\n"),
+            _ => format!("{line}\n"),
+        };
+        let all: String = text.lines().map(uncommented).collect();
+        assert_ne!(all, text, "it explains something");
+        all
+    }
 }

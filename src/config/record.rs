@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::{
-    Camera, ConfigError, Fault, Replay, Vehicle, load, read_camera,
+    Camera, ConfigError, Fault, Replay, Vehicle, load, read_camera, read_simulation,
     tables::{Nothing, Table, Tables},
 };
 use crate::{
@@ -63,18 +63,12 @@ impl RecordConfig {
             gpio: tables.or_empty("gpio").read(gpio::Settings::check)?,
             sync: tables.or_empty("sync").read(sync::Settings::check)?,
             recorder: tables.required("recorder")?.read(recorder::Settings::check)?,
-            simulation: tables
-                .optional("simulation")
-                .map(|table| table.read(simulated::Settings::check))
-                .transpose()?,
+            simulation: None,
         };
+        let simulation = tables.optional("simulation");
         tables.refuse_others("[vehicle], [camera], [gnss], [gpio], [sync], [recorder] or [simulation]")?;
-        let simulated = config.camera == Camera::Simulated || config.gnss == Gnss::Simulated;
-        match (&config.simulation, simulated) {
-            (None, true) => Err(Fault::new(text.len(), "a simulated driver needs the table [simulation]")),
-            (Some(_), false) => Err(Fault::new(0, "[simulation] is given, but no driver is `simulated`")),
-            _ => Ok(config),
-        }
+        let is_simulated = config.camera == Camera::Simulated || config.gnss == Gnss::Simulated;
+        Ok(Self { simulation: read_simulation(simulation, is_simulated)?, ..config })
     }
 
     /// Everything from a recording; `given`: how its bytes are decoded and its frames paired.
@@ -132,15 +126,12 @@ mod tests {
     use std::fs;
 
     use super::*;
+    use crate::config::tests::{shipped, with_defaults};
 
     const SHIPPED: [&str; 3] = ["record.toml", "simulated.toml", "replay.toml"];
     /// Keys that are commented out because there is no default.
-    const WITHOUT_DEFAULT: [&str; 5] =
-        ["calibration", "power_line_hz", "record_button_pin", "status_led_pin", "pps_pin"];
-
-    fn shipped(name: &str) -> PathBuf {
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(name)
-    }
+    const WITHOUT_DEFAULT: [&str; 8] =
+        ["calibration", "power_line_hz", "record_button_pin", "status_led_pin", "pps_pin", "kind", "at_s", "lasts_s"];
 
     #[test]
     fn every_shipped_file_loads_and_states_the_true_defaults() {
@@ -149,26 +140,11 @@ mod tests {
             let config = RecordConfig::load(&shipped(name)).unwrap_or_else(|error| panic!("{error}"));
             let again = RecordConfig::parse(&config.resolved()).unwrap_or_else(|fault| panic!("{name}: {fault:?}"));
             assert_eq!(again, config, "{name}");
-            let uncommented: String = text
-                .lines()
-                .map(|line| match line.strip_prefix("# ") {
-                    Some(setting) if is_setting(setting) => format!("{setting}\n"),
-                    _ => format!("{line}\n"),
-                })
-                .collect();
-            assert_ne!(uncommented, text, "{name} explains nothing");
-            let mut with_defaults =
-                RecordConfig::parse(&uncommented).unwrap_or_else(|fault| panic!("{name}: {fault:?}"));
-            with_defaults.resolve_paths(&shipped(""));
-            assert_eq!(with_defaults.resolved(), config.resolved(), "{name}");
+            let mut defaults = RecordConfig::parse(&with_defaults(&text, &WITHOUT_DEFAULT))
+                .unwrap_or_else(|fault| panic!("{name}: {fault:?}"));
+            defaults.resolve_paths(&shipped(""));
+            assert_eq!(defaults.resolved(), config.resolved(), "{name}");
         }
-    }
-
-    fn is_setting(line: &str) -> bool {
-        let Some((key, _)) = line.split_once(" = ") else { return false };
-        key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit())
-            && !WITHOUT_DEFAULT.contains(&key)
-            && !["kind", "at_s", "lasts_s"].contains(&key)
     }
 
     const LEAST: &str = "[vehicle]\nname = \"car\"\n[camera]\ndriver = \"none\"\n[gnss]\ndriver = \"none\"\n[recorder]\n\

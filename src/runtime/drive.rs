@@ -37,8 +37,12 @@ pub const SIMULATED_START: ClockReading =
 const SIMULATED_LEAD_S: f64 = 0.5;
 const LONGEST_LEAD_S: f64 = 2.0;
 
-/// Records a drive as `config` says, until it is told to stop or its devices end; `each_second` is told the status.
-pub fn record(config: &RecordConfig, each_second: impl FnMut(&omniloc::Status)) -> anyhow::Result<DriveReport> {
+/// Records a drive as `config` says, until it is told to stop or its devices end; `each_second` is told the status and
+/// says it in a line.
+pub fn record(
+    config: &RecordConfig,
+    each_second: impl FnMut(&omniloc::Status) -> String,
+) -> anyhow::Result<DriveReport> {
     let simulated = config.simulation.as_ref().map(simulate);
     let start = match (&config.simulation, replayed(config)) {
         (Some(_), _) => Some(SIMULATED_START),
@@ -154,13 +158,13 @@ pub fn clock(start: Option<ClockReading>, speed: f64, simulation: Option<&Simula
 }
 
 /// A serial line, and the thread that plays a simulated or replayed receiver into it.
-struct Line {
-    driver: DeviceRun<SerialEvent>,
-    player: Option<JoinHandle<()>>,
+pub struct Line {
+    pub driver: DeviceRun<SerialEvent>,
+    pub player: Option<JoinHandle<()>>,
 }
 
 /// The receiver's line, if there is one.
-fn gnss(
+pub fn gnss(
     config: &RecordConfig,
     simulation: Option<&(Simulation, &World)>,
     ports: &Path,
@@ -362,7 +366,7 @@ fn scaled_clock(start: ClockReading, speed: f64, simulation: Option<&Simulation>
 }
 
 /// `donut.json` as it is, once it is known to be one.
-fn read_calibration(path: &Path) -> anyhow::Result<Vec<u8>> {
+pub fn read_calibration(path: &Path) -> anyhow::Result<Vec<u8>> {
     let context = || format!("reading the calibration {}", path.display());
     let json = fs::read(path).with_context(context)?;
     let donut: DonutCalibration = serde_json::from_slice(&json).with_context(context)?;

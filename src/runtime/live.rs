@@ -17,10 +17,12 @@ use tokio::{
     sync::mpsc::{self, Receiver, Sender, error::TrySendError},
     time::MissedTickBehavior,
 };
-use tracing::{info, warn};
+use tracing::info;
 
 use super::{
-    supervisor::{Outcome, supervise},
+    service::Service,
+    signals::StopSignals,
+    supervisor::{Outcome, join_within, supervise},
     survey::{Device, Input, Sink, Survey, Tick},
     system::SystemMonitor,
     turn_watch::TurnWatch,
@@ -132,17 +134,15 @@ impl Sink for ToRecorder<'_> {
 
 /// Records until SIGTERM or SIGINT, or until every device has ended by itself as a replay does.
 ///
-/// `each_second` is told the status. The recorder is finished in any case.
+/// `each_second` is told the status and says it in a line. The recorder is finished in any case.
 pub async fn run(
     settings: DriveSettings,
     devices: Devices,
     recorder: Recorder,
     clock: Arc<dyn Clock>,
-    mut each_second: impl FnMut(&omniloc::Status),
+    mut each_second: impl FnMut(&omniloc::Status) -> String,
 ) -> anyhow::Result<DriveReport> {
-    let mut terminate = signal(SignalKind::terminate()).context("listening for SIGTERM")?;
-    let mut interrupt = signal(SignalKind::interrupt()).context("listening for SIGINT")?;
-    let mut hangup = signal(SignalKind::hangup()).context("listening for SIGHUP")?;
+    let mut stop_signals = StopSignals::listen()?;
     let mut mark = signal(SignalKind::user_defined1()).context("listening for SIGUSR1")?;
 
     let stop = Stop::default();
@@ -163,6 +163,7 @@ pub async fn run(
     let survey = Survey::new(&settings.decoder, &settings.sync, settings.log_offset_ns);
     let mut survey = survey.map_err(anyhow::Error::msg)?;
     let mut system = SystemMonitor::default();
+    let service = Service::ready();
     let mut seconds = tokio::time::interval(settings.second);
     seconds.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
@@ -186,21 +187,20 @@ pub async fn run(
                 survey.take(Input::Tick(tick), &mut out);
                 let status = survey.status();
                 settings.led.show(pattern(status));
-                each_second(status);
+                service.second([status.camera_health.as_str(), &status.gnss_health], &each_second(status));
                 if survey.has_ended() && frames.is_empty() && events.is_empty() {
                     info!("all devices have ended");
                     break;
                 }
             }
-            _ = terminate.recv() => { info!(signal = "SIGTERM", "stopping"); break; }
-            _ = interrupt.recv() => { info!(signal = "SIGINT", "stopping"); break; }
-            _ = hangup.recv() => { info!(signal = "SIGHUP", "stopping"); break; }
+            () = stop_signals.received() => break,
             _ = mark.recv() => { info!(signal = "SIGUSR1", "this piece of the recording is kept"); handle.mark(); }
         }
     }
 
+    service.stopping();
     stop.stop();
-    join_within(threads, DEVICES_STOP_LIMIT).await;
+    join_within(&threads, DEVICES_STOP_LIMIT).await;
     frames.close();
     events.close();
     while let Ok(input) = events.try_recv() {
@@ -276,16 +276,4 @@ fn start<Event: 'static>(
         reports.emit(Input::Health { device, health });
     };
     supervise(name, clock.clone(), stop.clone(), run, report).with_context(|| format!("starting the thread {name}"))
-}
-
-/// Waits for the device threads; one that hangs in a driver is left behind, and said so.
-async fn join_within(threads: Vec<JoinHandle<()>>, limit: Duration) {
-    const POLL: Duration = Duration::from_millis(10);
-    let deadline = tokio::time::Instant::now() + limit;
-    while threads.iter().any(|thread| !thread.is_finished()) && tokio::time::Instant::now() < deadline {
-        tokio::time::sleep(POLL).await;
-    }
-    for thread in threads.iter().filter(|thread| !thread.is_finished()) {
-        warn!(device = thread.thread().name().unwrap_or("?"), "device does not stop; leaving it behind");
-    }
 }

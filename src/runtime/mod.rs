@@ -11,7 +11,7 @@
 //! [`live::STOP_LIMIT`].
 //!
 //! `drive` puts a drive together, `live` runs it, `supervisor` keeps each device running, and `survey` is what becomes
-//! of what they say; `playback` takes a recorded drive through the same survey without any clock. `localize` is the same
+//! of what they say; `service` tells systemd how it goes; `playback` takes a recorded drive through the same survey without any clock. `localize` is the same
 //! for drives that are localized.
 
 // The same estimates on every computer.
@@ -22,8 +22,10 @@ pub mod drive;
 pub mod live;
 pub mod localize;
 pub mod playback;
+mod service;
+mod signals;
 mod status;
 mod supervisor;
 pub mod survey;
-mod system;
+pub mod system;
 mod turn_watch;

@@ -89,6 +89,18 @@ pub fn supervise(
     })
 }
 
+/// Waits for threads; one that hangs in a driver is left behind, and said so.
+pub async fn join_within(threads: &[JoinHandle<()>], limit: Duration) {
+    const POLL: Duration = Duration::from_millis(5);
+    let deadline = tokio::time::Instant::now() + limit;
+    while threads.iter().any(|thread| !thread.is_finished()) && tokio::time::Instant::now() < deadline {
+        tokio::time::sleep(POLL).await;
+    }
+    for thread in threads.iter().filter(|thread| !thread.is_finished()) {
+        warn!(thread = thread.thread().name().unwrap_or("?"), "does not stop; leaving it behind");
+    }
+}
+
 /// An error and its causes on one line.
 fn chain(error: &DeviceError) -> String {
     let mut text = error.to_string();

@@ -25,6 +25,7 @@ use super::{
     marks::{self, Marks},
     open_segment::{LINGER_NS, OpenSegment, PAIR_WAIT_NS},
     queue::Queued,
+    retry::Retry,
     segments::{Appender, Head, Part, Segment, SegmentName},
     storage::Storage,
 };
@@ -32,9 +33,6 @@ use crate::types::{Clock, NS_PER_S};
 
 /// Without frames for so long a segment may end anywhere.
 const FRAME_WAIT_NS: u64 = NS_PER_S;
-/// After a second failure in a row the disk is left alone for so long, then twice as long, at most the latter.
-const FIRST_RETRY_NS: u64 = NS_PER_S / 10;
-const LAST_RETRY_NS: u64 = 5 * NS_PER_S;
 /// How often free space is looked at, and how often a segment is deleted when there is too little.
 const GUARD_INTERVAL_NS: u64 = NS_PER_S / 2;
 /// Unsynced for longer than this: the disk is slow.
@@ -58,9 +56,7 @@ pub struct DriveWriter {
     /// Losses that are not written yet.
     losses: Vec<Loss>,
     released_bytes: usize,
-    retry_at_ns: u64,
-    /// In a row.
-    failures: u32,
+    retry: Retry,
     guard_at_ns: u64,
     marks: Marks,
     abandoned: Abandoned,
@@ -108,8 +104,7 @@ impl DriveWriter {
             closed_through: None,
             losses: Vec::new(),
             released_bytes: 0,
-            retry_at_ns: 0,
-            failures: 0,
+            retry: Retry::default(),
             guard_at_ns: 0,
             marks: Marks::default(),
             abandoned: Abandoned::default(),
@@ -163,7 +158,7 @@ impl DriveWriter {
         // A disk that failed just now gets a second chance on a new segment.
         for _ in 0..2 {
             self.write_losses();
-            self.retry_at_ns = 0;
+            self.retry.at_once();
             self.write_waiting();
             self.close();
             if self.sync(Which::Current) {
@@ -255,7 +250,7 @@ impl DriveWriter {
         let is_large = current.position.load(Ordering::Relaxed) >= self.settings.segment_mib << 20;
         let at_frame = matches!(entry, Entry::Image { .. })
             || now_ns.saturating_sub(current.last_image_ns.max(current.started_ns)) > FRAME_WAIT_NS;
-        (is_long || is_large) && at_frame && now_ns >= self.retry_at_ns
+        (is_long || is_large) && at_frame && self.retry.is_due(now_ns)
     }
 
     fn route(&self, entry: &Entry) -> Route {
@@ -338,15 +333,15 @@ impl DriveWriter {
         if self.facts.error.take().is_some() {
             info!("the disk works again");
         }
-        self.failures = 0;
+        self.retry.succeeded();
     }
 
     /// Starts the next segment; the present one, synced, waits for its pairs. `false`: it could not be started.
     fn start_segment(&mut self) -> bool {
-        if self.clock.monotonic_ns() < self.retry_at_ns {
+        if !self.retry.is_due(self.clock.monotonic_ns()) {
             return false;
         }
-        if self.current.is_some() && !self.sync(Which::Current) && self.clock.monotonic_ns() < self.retry_at_ns {
+        if self.current.is_some() && !self.sync(Which::Current) && !self.retry.is_due(self.clock.monotonic_ns()) {
             return false;
         }
         self.keep_room();
@@ -444,7 +439,7 @@ impl DriveWriter {
         }
     }
 
-    /// Decides when to try again: at once the first time and when room could be made, then later and later.
+    /// Says what is wrong, makes room if that is what is missing, and decides when to try again.
     fn note_failure(&mut self, error: &io::Error) {
         let word = match error.kind() {
             io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => disk::FULL,
@@ -456,14 +451,8 @@ impl DriveWriter {
         }
         self.facts.error = Some(word);
         self.facts.last_error = Some(error.to_string());
-        self.failures = self.failures.saturating_add(1);
-        let has_room = word == disk::FULL && self.delete_oldest();
-        let delay_ns = match self.failures {
-            1 => 0,
-            _ if has_room => 0,
-            failures => (FIRST_RETRY_NS << (failures - 2).min(16)).min(LAST_RETRY_NS),
-        };
-        self.retry_at_ns = self.clock.monotonic_ns() + delay_ns;
+        let has_room_now = word == disk::FULL && self.delete_oldest();
+        self.retry.failed(self.clock.monotonic_ns(), has_room_now);
     }
 
     fn keep_room(&mut self) {

@@ -18,6 +18,7 @@ mod marks;
 mod mend;
 mod open_segment;
 mod queue;
+mod retry;
 mod segments;
 mod storage;
 mod thread;

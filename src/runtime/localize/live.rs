@@ -10,11 +10,7 @@ use std::{
 };
 
 use anyhow::Context;
-use tokio::{
-    select,
-    signal::unix::{SignalKind, signal},
-    time::MissedTickBehavior,
-};
+use tokio::{select, time::MissedTickBehavior};
 use tracing::{info, warn};
 
 use super::{
@@ -27,11 +23,13 @@ use crate::{
     localize::Timings,
     map::OpenMap,
     outputs::{OutputReport, Outputs},
-    recording::recorder::{Encoder, Head, Recorder, RecorderHandle, RecorderReport},
+    recording::recorder::{Head, Recorder, RecorderHandle, RecorderReport},
     runtime::{
         drive::{self, SIMULATED_START},
         live::DeviceRun,
-        supervisor::{self, supervise},
+        service::Service,
+        signals::StopSignals,
+        supervisor::{self, join_within, supervise},
         system::{SystemMonitor, SystemStatus},
     },
     types::{Clock, PositionEstimate},
@@ -76,8 +74,11 @@ struct Shared {
 }
 
 /// Localizes as `config` says, until it is told to stop or the camera ends as a replay does; `each_second` is told the
-/// status.
-pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus)) -> anyhow::Result<LocalizeReport> {
+/// status and says it in a line.
+pub fn localize(
+    config: &LocalizeConfig,
+    each_second: impl FnMut(&LocalizeStatus) -> String,
+) -> anyhow::Result<LocalizeReport> {
     let map = open_map(&config.map.file)?;
     let watched = MapWatch::new(&config.map.file);
     let outputs = Outputs::start(&config.outputs, map.info.origin)?;
@@ -96,7 +97,6 @@ pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus
     let clock = drive::clock(start, speed, simulation.as_ref().map(|(simulation, _)| simulation));
 
     let recorder = start_recorder(config, calibration, &clock)?;
-    let recorded = recorder.as_ref().map(|(recorder, encoder)| (recorder.handle(), encoder.clone()));
 
     let frames = Arc::new(Newest::default());
     let shared = Arc::<Mutex<Shared>>::default();
@@ -104,7 +104,7 @@ pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus
     let stop = Stop::default();
     let camera = start_camera(camera, &frames, &health, &clock, &stop)?;
     let outputs = Arc::new(outputs);
-    let sinks = Sinks { outputs: outputs.clone(), recorded };
+    let sinks = Sinks { outputs: outputs.clone(), recorder: recorder.as_ref().map(Recorder::handle) };
     let localizer = start_localizer(session, &frames, &shared, sinks, &clock)?;
 
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("starting the runtime")?;
@@ -113,13 +113,13 @@ pub fn localize(config: &LocalizeConfig, each_second: impl FnMut(&LocalizeStatus
     let outcome = runtime.block_on(until_stopped(&mut watch, second, &localizer, each_second));
 
     stop.stop();
-    join_within(&camera, STOP_LIMIT);
+    runtime.block_on(join_within(&[camera], STOP_LIMIT));
     watch.frames.close();
-    join_within(&localizer, STOP_LIMIT);
+    runtime.block_on(join_within(&[localizer], STOP_LIMIT));
     outcome?;
     let status = watch.status(0.0);
     let error = watch.shared().error.take();
-    let recorder = recorder.map(|(recorder, _)| recorder.finish(RECORDER_STOP_LIMIT));
+    let recorder = recorder.map(|recorder| recorder.finish(RECORDER_STOP_LIMIT));
     // The localizer's thread has its own handle; once that has ended this is the last.
     let outputs = Arc::try_unwrap(outputs).map_or_else(|outputs| outputs.reports(), Outputs::finish);
     match error {
@@ -168,16 +168,14 @@ fn start_camera(
 /// Where estimates go.
 struct Sinks {
     outputs: Arc<Outputs>,
-    recorded: Option<(RecorderHandle, Encoder)>,
+    recorder: Option<RecorderHandle>,
 }
 
 impl Sinks {
     fn send(&self, estimate: &PositionEstimate, utc_ns: Option<i64>) {
         self.outputs.send(estimate, utc_ns);
-        if let Some((recorder, encoder)) = &self.recorded {
-            let (message, pose) = encoder.estimate(estimate);
-            recorder.push(message);
-            pose.into_iter().for_each(|pose| _ = recorder.push(pose));
+        if let Some(recorder) = &self.recorder {
+            recorder.push_estimate(estimate);
         }
     }
 }
@@ -186,15 +184,14 @@ fn start_recorder(
     config: &LocalizeConfig,
     calibration_json: Vec<u8>,
     clock: &Arc<dyn Clock>,
-) -> anyhow::Result<Option<(Recorder, Encoder)>> {
+) -> anyhow::Result<Option<Recorder>> {
     let Some(settings) = &config.recorder else { return Ok(None) };
     let boot_id = drive::boot_id();
     let mut head = Head::new(&config.resolved(), &config.vehicle.name, &boot_id, clock.read());
     head.calibration_json = Some(calibration_json);
     head.name_source(&config.vehicle.name);
     head.name_command("localize");
-    let encoder = Encoder::new(head.log_offset_ns);
-    Ok(Some((drive::start_recorder(settings, head, &boot_id, clock)?, encoder)))
+    Ok(Some(drive::start_recorder(settings, head, &boot_id, clock)?))
 }
 
 fn start_localizer(
@@ -264,11 +261,10 @@ async fn until_stopped(
     watch: &mut Watch,
     second: Duration,
     localizer: &JoinHandle<()>,
-    mut each_second: impl FnMut(&LocalizeStatus),
+    mut each_second: impl FnMut(&LocalizeStatus) -> String,
 ) -> anyhow::Result<()> {
-    let mut terminate = signal(SignalKind::terminate()).context("listening for SIGTERM")?;
-    let mut interrupt = signal(SignalKind::interrupt()).context("listening for SIGINT")?;
-    let mut hangup = signal(SignalKind::hangup()).context("listening for SIGHUP")?;
+    let mut stop_signals = StopSignals::listen()?;
+    let service = Service::ready();
     let mut seconds = tokio::time::interval(second);
     seconds.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut frames_before = 0;
@@ -278,29 +274,21 @@ async fn until_stopped(
                 watch.map.look();
                 let frames = watch.shared().counts.frames;
                 let status = watch.status((frames - frames_before) as f64);
+                // Frames that come and are not looked at.
+                let hangs = status.camera_health == "ok" && frames == frames_before;
                 frames_before = frames;
-                each_second(&status);
+                let line = each_second(&status);
+                service.second([if hangs { "silent" } else { status.camera_health }], &line);
                 if localizer.is_finished() {
                     info!("all frames are done with");
                     return Ok(());
                 }
             }
-            _ = terminate.recv() => { info!(signal = "SIGTERM", "stopping"); return Ok(()); }
-            _ = interrupt.recv() => { info!(signal = "SIGINT", "stopping"); return Ok(()); }
-            _ = hangup.recv() => { info!(signal = "SIGHUP", "stopping"); return Ok(()); }
+            () = stop_signals.received() => {
+                service.stopping();
+                return Ok(());
+            }
         }
-    }
-}
-
-/// Waits for a thread; one that hangs in a driver is left behind, and said so.
-fn join_within(thread: &JoinHandle<()>, limit: Duration) {
-    const POLL: Duration = Duration::from_millis(5);
-    let deadline = std::time::Instant::now() + limit;
-    while !thread.is_finished() && std::time::Instant::now() < deadline {
-        std::thread::sleep(POLL);
-    }
-    if !thread.is_finished() {
-        warn!(thread = thread.thread().name().unwrap_or("?"), "does not stop; leaving it behind");
     }
 }
 
