@@ -433,7 +433,7 @@ mod tests {
         let mut belief = Belief::uniform(&cells);
         belief.weigh(&hill_at(&cells, [20.0, 15.0], 1.0), 1.0);
         belief.spread([0.3, -0.2], 0.1);
-        let part = belief.on(&cells.within(24..60, 10..50));
+        let part = belief.on(&cells.within(24..60, 10..50).expect("some"));
         let same = |a: Mode, b: Mode| {
             assert!(
                 (a.mean_m[0] - b.mean_m[0]).abs() < 1e-3 && (a.mean_m[1] - b.mean_m[1]).abs() < 1e-3,
@@ -444,7 +444,7 @@ mod tests {
         same(part.mode(), belief.mode());
         same(part.on(&cells).mode(), belief.mode());
         // Nothing is left where nothing was.
-        let elsewhere = belief.on(&cells.within(0..5, 0..5)).mode();
+        let elsewhere = belief.on(&cells.within(0..5, 0..5).expect("some")).mode();
         assert!(elsewhere.mean_m[0] < 3.0, "{elsewhere:?}");
     }
 

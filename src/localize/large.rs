@@ -143,8 +143,12 @@ impl LargeMap {
         }
         let [columns, rows] = self.part(middle, near + LASTING_STEPS);
         let window = Window::new(&self.map, whole_blocks(columns, grid.columns), whole_blocks(rows, grid.rows));
-        tracker.look_at(&window.cells);
-        self.window = Some(window);
+        match &window {
+            Some(window) => tracker.look_at(&window.cells),
+            // Between cells that are far apart.
+            None => self.look_everywhere(tracker),
+        }
+        self.window = window;
         Ok(())
     }
 
@@ -241,8 +245,9 @@ impl LargeMap {
 }
 
 impl Window {
-    fn new(map: &OpenMap, columns: Range<u32>, rows: Range<u32>) -> Self {
-        let cells = map.cells.within(columns.clone(), rows.clone());
+    /// `None` where no candidate is.
+    fn new(map: &OpenMap, columns: Range<u32>, rows: Range<u32>) -> Option<Self> {
+        let cells = map.cells.within(columns.clone(), rows.clone())?;
         let is_inside = |corner: [u32; 2]| columns.contains(&corner[0]) && rows.contains(&corner[1]);
         let inside = map.blocks.iter().enumerate().filter(|(_, block)| is_inside(block.corner));
         let blocks = inside.map(|(number, block)| {
@@ -253,7 +258,7 @@ impl Window {
             (number, block.cells.iter().map(place).collect())
         });
         let blocks = blocks.collect();
-        Self { columns, rows, cells, blocks }
+        Some(Self { columns, rows, cells, blocks })
     }
 
     fn covers(&self, columns: &Range<u32>, rows: &Range<u32>) -> bool {

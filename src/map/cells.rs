@@ -94,11 +94,11 @@ impl CandidateCells {
         Ok(Self { grid, cells })
     }
 
-    /// The candidates in a part of the grid, on a grid of their own.
+    /// The candidates in a part of the grid, on a grid of their own; `None` if there are none.
     ///
     /// # Panics
-    /// When there are none, or the part lies outside the grid.
-    pub fn within(&self, columns: Range<u32>, rows: Range<u32>) -> Self {
+    /// When the part lies outside the grid.
+    pub fn within(&self, columns: Range<u32>, rows: Range<u32>) -> Option<Self> {
         assert!(columns.end <= self.grid.columns && rows.end <= self.grid.rows, "a part of the grid");
         let grid = Grid {
             origin_m: self.grid.center_m([columns.start, rows.start]),
@@ -108,8 +108,7 @@ impl CandidateCells {
         };
         let inside = self.cells.iter().filter(|[i, j]| columns.contains(i) && rows.contains(j));
         let cells: Vec<[u32; 2]> = inside.map(|[i, j]| [i - columns.start, j - rows.start]).collect();
-        assert!(!cells.is_empty(), "no candidates");
-        Self { grid, cells }
+        (!cells.is_empty()).then_some(Self { grid, cells })
     }
 
     pub fn len(&self) -> usize {
@@ -180,7 +179,8 @@ mod tests {
     #[test]
     fn a_part_keeps_its_places() {
         let cells = CandidateCells::around(&[[0.0, 0.0], [10.0, 10.0]], 0.5, Some(2.0)).expect("a small grid");
-        let part = cells.within(14..21, 16..20);
+        assert_eq!(cells.within(0..3, 15..21), None);
+        let part = cells.within(14..21, 16..20).expect("the far corner");
         let inside = |p: &&PositionM| (7.0..=10.0).contains(&p[0]) && (8.0..=9.5).contains(&p[1]);
         assert_eq!(part.centers_m(), cells.centers_m().iter().filter(inside).copied().collect::<Vec<_>>());
         assert!(part.len() > 4 && part.index_of([6, 3]).is_some());
