@@ -8,6 +8,9 @@ use serde_json::json;
 
 use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
+#[cfg(not(feature = "report"))]
+use super::reporter::TrialFacts;
+use super::reporter::Reporter;
 use super::survey::{
     bad_argument, default_grid_step_m, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
     read_to_match, read_truth,
@@ -18,6 +21,8 @@ use crate::features::Descriptor;
 use crate::map::{FeatureMap, Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
 use crate::metrics::{ErrorFigures, component_median};
 use crate::recording::{Recording, write_bytes_atomically};
+#[cfg(feature = "report")]
+use crate::report::TrialFacts;
 use crate::train::{Outcome, Similarity, Split, Survey, TrackSmoother, Trial, noisy, run as run_trial};
 use crate::types::PositionM;
 
@@ -89,7 +94,14 @@ pub struct Args {
     /// Put every test frame's estimate into the JSON
     #[arg(long, requires = "json")]
     pub frames: bool,
-    /// Replace the JSON file if it exists
+    /// Write a page with figures and tables into this folder, with the figures as SVG and PNG and every number that is
+    /// drawn as JSON
+    #[arg(long, value_name = "DIR")]
+    pub report: Option<PathBuf>,
+    /// With --map and --report: recordings that the map was learned from, to show their images beside the worst frames
+    #[arg(long, value_name = "REC.mcap", requires_all = ["map", "report"], num_args = 1)]
+    pub survey: Vec<PathBuf>,
+    /// Replace the JSON file or the report if it exists
     #[arg(long)]
     pub force: bool,
 }
@@ -113,7 +125,7 @@ struct Case {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let entries = evaluate(args)?;
     if let Some(path) = &args.json {
-        write_json(path, args, &entries)?;
+        write_json(path, args, entries)?;
     }
     Ok(DONE.into())
 }
@@ -137,20 +149,62 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
     // Against a map every frame counts: only learning is costly.
     let spacing_m = args.spacing_m.or(args.map.as_ref().map(|_| 0.0));
     let recordings = open_recordings(&args.recordings, spacing_m)?;
+    let mut reporter = args.report.as_ref().map(|folder| Reporter::new(folder, args.force, settings(args))).transpose()?;
+    let surveys = if args.survey.is_empty() { Vec::new() } else { open_recordings(&args.survey, Some(0.0))? };
     let progress = Progress::new();
     let mut all = Vec::new();
     for (number, recording) in recordings.iter().enumerate() {
         let entries = match &args.map {
-            Some(path) => on_map(args, path, recording, &progress)?,
-            None => protocol(args, recording, &progress)?,
+            Some(path) => on_map(args, path, recording, reporter.as_mut(), &progress)?,
+            None => protocol(args, recording, reporter.as_mut(), &progress)?,
         };
+        if let Some(reporter) = &mut reporter {
+            reporter.take_entries(&entries);
+        }
         progress.finish();
         print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
         print(&in_words(&entries))?;
         all.extend(entries);
     }
     print(&format!("\n{LEGEND}"))?;
+    if let Some(reporter) = reporter {
+        let page = reporter.write(&recordings, &surveys, &progress)?;
+        progress.finish();
+        print(&format!("\nreport     {}\n", page.display()))?;
+    }
     Ok(all)
+}
+
+/// Options and what they were, for the report.
+fn settings(args: &Args) -> Vec<(String, String)> {
+    let list = |values: &mut dyn Iterator<Item = String>| values.collect::<Vec<_>>().join(", ");
+    let own = |what: &str| format!("as the recipe has it{what}");
+    let mut settings = vec![("recordings", list(&mut args.recordings.iter().map(|path| path.display().to_string())))];
+    match &args.map {
+        Some(map) => settings.push(("map", map.display().to_string())),
+        None => settings.extend([
+            ("recipes", list(&mut args.recipe.iter().map(|recipe| recipe.name().into()))),
+            ("feature types", match args.features.is_empty() {
+                true => own(""),
+                false => list(&mut args.features.iter().map(|descriptor| descriptor.name().into())),
+            }),
+            ("selection", args.select.map_or_else(|| own(""), |select| format!("{select:?}").to_lowercase())),
+            ("splits", list(&mut args.split.iter().cloned())),
+            ("seeds", list(&mut (args.seed..args.seed + args.seeds).map(|seed| seed.to_string()))),
+            ("variants of the random split", list(&mut args.variants.iter().map(|v| format!("{v:?}").to_lowercase()))),
+            ("smoothing of the track", args.smooth.map_or_else(|| own(""), |smooth| format!("{smooth:?}").to_lowercase())),
+            ("grid step", args.grid_step_m.map_or("1 m outdoors, 0.1 m within 20 m".into(), |step_m| format!("{step_m} m"))),
+        ]),
+    }
+    let spacing = match (args.spacing_m, &args.map) {
+        (Some(spacing_m), _) => format!("{spacing_m} m"),
+        (None, Some(_)) => "none: every frame".into(),
+        (None, None) => "none up to 800 frames".into(),
+    };
+    settings.push(("least spacing of the frames", spacing));
+    let truth = args.truth.as_ref().map_or("positions as recorded".into(), |path| path.display().to_string());
+    settings.push(("errors are measured against", truth));
+    settings.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
 /// What a table has no columns for: how far the estimates against a map may be trusted.
@@ -183,7 +237,13 @@ fn in_words(entries: &[Entry]) -> String {
 }
 
 /// Every frame of `recording` against a map.
-fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) -> anyhow::Result<Vec<Entry>> {
+fn on_map(
+    args: &Args,
+    path: &Path,
+    recording: &Recording,
+    reporter: Option<&mut Reporter>,
+    progress: &Progress,
+) -> anyhow::Result<Vec<Entry>> {
     let map = open_map(path)?;
     if map.info.recordings.iter().any(|trained_on| trained_on.name == recording.name) {
         eprintln!("warning: the map was trained on {}: it knows these frames, and the errors flatter", recording.name);
@@ -216,6 +276,10 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
     };
     let know_nothing_m = component_median(&map.positions_m);
     let outcomes = against_map(&survey, &map, &truth_m);
+    if let Some(reporter) = reporter {
+        reporter.begin(&recording, &survey, &truth_m)?;
+        reporter.take_map(&survey, path, &map, &outcomes.sequences)?;
+    }
     let mut entries: Vec<Entry> = outcomes
         .single
         .into_iter()
@@ -231,7 +295,7 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
                 ..base.clone()
             };
             let entry = entry.with_figures(ErrorFigures::of(&outcome.estimates_m, &truth_m, know_nothing_m));
-            if args.frames { entry.with_frames(&indices, &truth_m, &outcome.estimates_m) } else { entry }
+            entry.with_frames(&indices, &truth_m, &outcome.estimates_m)
         })
         .collect();
     let stamps_ns: Vec<u64> = survey.frames.iter().map(|frame| frame.stamp_ns).collect();
@@ -248,7 +312,7 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
         };
         let entry = entry.with_figures(ErrorFigures::of(&estimates_m, &said_truth_m, know_nothing_m));
         let entry = figures.map_or(entry.clone(), |figures| entry.with_sequence(&figures));
-        entries.push(if args.frames { entry.with_poses(&indices, &truth_m, sequence) } else { entry });
+        entries.push(entry.with_poses(&indices, &truth_m, sequence));
     }
     entries.push(median_entry(base, &map.positions_m, &truth_m));
     Ok(entries)
@@ -261,7 +325,12 @@ pub fn open_map(path: &Path) -> anyhow::Result<FeatureMap> {
 }
 
 /// The paper's protocol on one recording.
-fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::Result<Vec<Entry>> {
+fn protocol(
+    args: &Args,
+    recording: &Recording,
+    mut reporter: Option<&mut Reporter>,
+    progress: &Progress,
+) -> anyhow::Result<Vec<Entry>> {
     let recipes: Vec<Recipe> = args
         .recipe
         .iter()
@@ -279,6 +348,9 @@ fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::
         eprintln!("note: {}: not every frame has a yaw; there are no (fixed) rows", recording.name);
     }
     let truth_m = truth(args, &plain)?;
+    if let Some(reporter) = &mut reporter {
+        reporter.begin(recording, &plain, &truth_m)?;
+    }
     let similarity = |recipe: &Recipe| match smoothing(args, recipe) {
         Smoothing::None => None,
         Smoothing::Track => Similarity::of(&plain, recipe),
@@ -293,7 +365,7 @@ fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::
             _ => &plain,
         };
         let learning = Learning { recipes: &recipes, similarities: &similarities, smoother: &smoother };
-        entries.extend(trial_entries(args, recording, survey, &learning, &truth_m, &case, progress)?);
+        entries.extend(trial_entries(args, recording, survey, &learning, &truth_m, &case, reporter.as_deref_mut(), progress)?);
     }
     Ok(entries)
 }
@@ -343,6 +415,7 @@ fn trial_entries(
     learning: &Learning,
     truth_m: &[PositionM],
     case: &Case,
+    mut reporter: Option<&mut Reporter>,
     progress: &Progress,
 ) -> anyhow::Result<Vec<Entry>> {
     let recorded_m = match case.variant {
@@ -398,6 +471,11 @@ fn trial_entries(
         };
         let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &learned_m };
         let outcomes = run_trial(survey, &trial, |step| progress.step(&part, step)).map_err(bad_argument)?;
+        if let (Some(reporter), Variant::Plain) = (&mut reporter, case.variant) {
+            let (split_name, seed, learned_m) = (&case.split_name[..], case.seed, &learned_m[..]);
+            let facts = TrialFacts { recipe, split: &case.split, split_name, seed, grid_step_m, learned_m, truth_m };
+            reporter.take_trial(survey, &facts, &outcomes)?;
+        }
         for outcome in &outcomes.rows {
             for (warning, count) in outcome.warnings.iter().filter(|_| announced) {
                 let (features, of) = (&outcome.features, outcome.rank);
@@ -406,7 +484,7 @@ fn trial_entries(
             let base = Entry { n_learned_from: outcomes.learned_from, ..base.clone() };
             let entry = outcome_entry(base, recipe, outcome, &validation_m, &test_m, know_nothing_m);
             let estimates_m = estimates_of(recipe, outcome);
-            entries.push(if args.frames { entry.with_frames(&indices, &test_m, estimates_m) } else { entry });
+            entries.push(entry.with_frames(&indices, &test_m, estimates_m));
         }
     }
     entries.push(median_entry(base, &pick(&case.split.learning, &recorded_m), &test_m));
@@ -472,7 +550,10 @@ fn truth(args: &Args, survey: &Survey) -> anyhow::Result<Vec<PositionM>> {
     }
 }
 
-fn write_json(path: &Path, args: &Args, entries: &[Entry]) -> anyhow::Result<()> {
+fn write_json(path: &Path, args: &Args, mut entries: Vec<Entry>) -> anyhow::Result<()> {
+    if !args.frames {
+        entries.iter_mut().for_each(|entry| entry.frames = None);
+    }
     let command: Vec<String> = std::env::args().collect();
     let datasets: Vec<String> = args.recordings.iter().map(|path| path.display().to_string()).collect();
     let object = json!({

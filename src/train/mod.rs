@@ -21,9 +21,9 @@ pub use group::{LearnError, LearnedGroup};
 pub use split::{Split, SplitError};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
-pub use temperature::covers;
+pub use temperature::{covers, credible_level};
 pub use track::{Similarity, Smoothed, TrackSmoother};
-pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
+pub use trial::{EliminationOnTest, Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
 pub use update::{BeforeAndAfter, UpdateError, UpdateReport, update};
 
 use crate::gp::LearningPositions;
