@@ -41,7 +41,8 @@ fn map_report() -> PathBuf {
     let folder = FOLDER.get_or_init(|| {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let (dataset, recording) = (folder.path().join("evening"), folder.path().join("evening.mcap"));
-        let place = ["--world", "corridor", "--seed", common::map::SEED, "--day", "2", "--frames", "60", "--size", "320x180"];
+        let place =
+            ["--world", "corridor", "--seed", common::map::SEED, "--day", "2", "--frames", "60", "--size", "320x180"];
         omniloc().arg("simulate").args(place).arg("--out").arg(&dataset).assert().success();
         omniloc().arg("import").arg(&dataset).arg("--out").arg(&recording).assert().success();
         let report = folder.path().join("report");

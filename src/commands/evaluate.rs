@@ -8,9 +8,9 @@ use serde_json::json;
 
 use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
+use super::reporter::Reporter;
 #[cfg(not(feature = "report"))]
 use super::reporter::TrialFacts;
-use super::reporter::Reporter;
 use super::survey::{
     bad_argument, default_grid_step_m, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
     read_to_match, read_truth,
@@ -149,7 +149,8 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
     // Against a map every frame counts: only learning is costly.
     let spacing_m = args.spacing_m.or(args.map.as_ref().map(|_| 0.0));
     let recordings = open_recordings(&args.recordings, spacing_m)?;
-    let mut reporter = args.report.as_ref().map(|folder| Reporter::new(folder, args.force, settings(args))).transpose()?;
+    let mut reporter =
+        args.report.as_ref().map(|folder| Reporter::new(folder, args.force, settings(args))).transpose()?;
     let surveys = if args.survey.is_empty() { Vec::new() } else { open_recordings(&args.survey, Some(0.0))? };
     let progress = Progress::new();
     let mut all = Vec::new();
@@ -184,16 +185,25 @@ fn settings(args: &Args) -> Vec<(String, String)> {
         Some(map) => settings.push(("map", map.display().to_string())),
         None => settings.extend([
             ("recipes", list(&mut args.recipe.iter().map(|recipe| recipe.name().into()))),
-            ("feature types", match args.features.is_empty() {
-                true => own(""),
-                false => list(&mut args.features.iter().map(|descriptor| descriptor.name().into())),
-            }),
+            (
+                "feature types",
+                match args.features.is_empty() {
+                    true => own(""),
+                    false => list(&mut args.features.iter().map(|descriptor| descriptor.name().into())),
+                },
+            ),
             ("selection", args.select.map_or_else(|| own(""), |select| format!("{select:?}").to_lowercase())),
             ("splits", list(&mut args.split.iter().cloned())),
             ("seeds", list(&mut (args.seed..args.seed + args.seeds).map(|seed| seed.to_string()))),
             ("variants of the random split", list(&mut args.variants.iter().map(|v| format!("{v:?}").to_lowercase()))),
-            ("smoothing of the track", args.smooth.map_or_else(|| own(""), |smooth| format!("{smooth:?}").to_lowercase())),
-            ("grid step", args.grid_step_m.map_or("1 m outdoors, 0.1 m within 20 m".into(), |step_m| format!("{step_m} m"))),
+            (
+                "smoothing of the track",
+                args.smooth.map_or_else(|| own(""), |smooth| format!("{smooth:?}").to_lowercase()),
+            ),
+            (
+                "grid step",
+                args.grid_step_m.map_or("1 m outdoors, 0.1 m within 20 m".into(), |step_m| format!("{step_m} m")),
+            ),
         ]),
     }
     let spacing = match (args.spacing_m, &args.map) {
@@ -365,7 +375,16 @@ fn protocol(
             _ => &plain,
         };
         let learning = Learning { recipes: &recipes, similarities: &similarities, smoother: &smoother };
-        entries.extend(trial_entries(args, recording, survey, &learning, &truth_m, &case, reporter.as_deref_mut(), progress)?);
+        entries.extend(trial_entries(
+            args,
+            recording,
+            survey,
+            &learning,
+            &truth_m,
+            &case,
+            reporter.as_deref_mut(),
+            progress,
+        )?);
     }
     Ok(entries)
 }

@@ -67,7 +67,12 @@ impl Reporter {
     }
 
     /// Writes the report; returns its page. `surveys` are recordings that the map was learned from.
-    pub fn write(self, recordings: &[Recording], surveys: &[Recording], progress: &Progress) -> anyhow::Result<PathBuf> {
+    pub fn write(
+        self,
+        recordings: &[Recording],
+        surveys: &[Recording],
+        progress: &Progress,
+    ) -> anyhow::Result<PathBuf> {
         let now_s = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
         let report = Report {
             program: env!("CARGO_PKG_VERSION").into(),
@@ -104,7 +109,9 @@ fn check_folder(folder: &Path, force: bool) -> anyhow::Result<()> {
     }
     let is_ours = |path: &Path| match path.file_name().and_then(|name| name.to_str()) {
         Some(PAGE | JSON) => path.is_file(),
-        Some(FIGURES) => fs::read_dir(path).is_ok_and(|entries| entries.flatten().all(|entry| is_figure(&entry.path()))),
+        Some(FIGURES) => {
+            fs::read_dir(path).is_ok_and(|entries| entries.flatten().all(|entry| is_figure(&entry.path())))
+        }
         _ => false,
     };
     let entries = fs::read_dir(folder).with_context(|| format!("reading the folder {}", folder.display()))?;

@@ -6,7 +6,7 @@ use super::figure::slug;
 use super::insight::{FrameAnswer, Insight, InsightError, TrialFacts, answers_of_sequence};
 use super::photograph::Photograph;
 use crate::evaluate::{Entry, Sequence};
-use crate::map::{FeatureMap, MapInfo, Selection};
+use crate::map::{FeatureMap, MapInfo};
 use crate::recording::Recording;
 use crate::train::{Outcomes, Split, Survey, SurveyedFrame};
 use crate::types::{DonutCalibration, LocalizationState, PositionM};
@@ -31,8 +31,6 @@ pub struct Dataset {
     pub map: Option<MapFacts>,
     /// By row.
     pub photographs: BTreeMap<usize, Photograph>,
-    /// Learning images of the map at the places that the gallery asks for: by position of the map.
-    pub learning_photographs: BTreeMap<usize, Photograph>,
 }
 
 /// Where the data is from.
@@ -92,7 +90,30 @@ pub struct MapFacts {
     pub cells: usize,
 }
 
+/// What counts as near and as gross: in a room other distances matter than in a street.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Yardstick {
+    /// Bounds of the classes that errors are coloured by.
+    pub error_classes_m: [f64; 4],
+    /// Distances at which a frame counts as found.
+    pub recall_m: [f64; 4],
+    pub near_m: f64,
+    pub gross_m: f64,
+}
+
+const STREET: Yardstick =
+    Yardstick { error_classes_m: [1.0, 2.0, 5.0, 10.0], recall_m: [1.0, 2.0, 5.0, 10.0], near_m: 2.0, gross_m: 10.0 };
+const ROOM: Yardstick =
+    Yardstick { error_classes_m: [0.1, 0.2, 0.5, 1.0], recall_m: [0.1, 0.2, 0.5, 1.0], near_m: 0.5, gross_m: 1.0 };
+
 impl Dataset {
+    pub fn yardstick(&self) -> Yardstick {
+        /// Positions that lie within so much are in a room \[m\].
+        const ROOM_M: f64 = 20.0;
+        let [east_m, north_m] = self.provenance.extent_m;
+        if east_m.hypot(north_m) < ROOM_M { ROOM } else { STREET }
+    }
+
     /// `sha256` is that of the file.
     pub fn new(recording: &Recording, sha256: String, survey: &Survey, truth_m: &[PositionM]) -> Self {
         let positions_m = survey.positions_m();
@@ -133,7 +154,6 @@ impl Dataset {
             sequences: Vec::new(),
             map: None,
             photographs: BTreeMap::new(),
-            learning_photographs: BTreeMap::new(),
         }
     }
 
@@ -195,11 +215,6 @@ impl Dataset {
             }
         }
         names
-    }
-
-    /// Whether any recipe removed features one by one.
-    pub fn selects(&self) -> bool {
-        self.map.as_ref().is_none_or(|map| map.info.selection != Selection::None) && !self.eliminations.is_empty()
     }
 }
 

@@ -3,7 +3,7 @@
 use serde_json::Value;
 
 use super::chart::color::PAPER;
-use super::chart::plot::Panel;
+use super::chart::plot::{HALF_WIDTH_PX, PANEL_WIDTH_PX, Panel};
 use super::chart::svg::{Paint, Shapes, document};
 
 #[derive(Debug, Clone)]
@@ -58,6 +58,17 @@ impl Figure {
         Self { panels, ..self }
     }
 
+    /// Panels that `build` makes for a width: one, two or four of them two a row, others three a row; on a telephone one.
+    pub fn responsive(self, build: impl Fn(f64) -> Vec<Panel>) -> Self {
+        let narrow = build(PANEL_WIDTH_PX);
+        if matches!(narrow.len(), 1 | 2 | 4) { self.halves(build) } else { Self { panels: narrow, columns: 3, ..self } }
+    }
+
+    /// Panels that `build` makes for a width, two a row; on a telephone one.
+    pub fn halves(self, build: impl Fn(f64) -> Vec<Panel>) -> Self {
+        Self { panels: build(HALF_WIDTH_PX), narrow: build(PANEL_WIDTH_PX), columns: 2, ..self }
+    }
+
     /// All panels as one SVG, on white.
     pub fn whole(&self) -> String {
         const GAP_PX: f64 = 24.0;
@@ -83,6 +94,12 @@ impl Figure {
         }
         document([width, height], &shapes, &self.title)
     }
+}
+
+/// With a capital first letter.
+pub fn capitalized(text: &str) -> String {
+    let mut characters = text.chars();
+    characters.next().map_or(String::new(), |first| first.to_uppercase().chain(characters).collect())
 }
 
 /// Letters, digits and single hyphens of a name: for files and addresses.

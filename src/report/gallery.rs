@@ -4,10 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
 
-use super::chart::color::{FAINT, INK, VERMILION};
-use super::chart::map_plot::map_plot_of_width;
+use super::chart::color::{FAINT, GRID, INK, PAPER, VERMILION};
+use super::chart::map_plot::Extent;
+use super::chart::plot::NOTE;
 use super::chart::scale::meters;
-use super::chart::svg::{Paint, document, escaped};
+use super::chart::svg::{Paint, Shapes, document, escaped};
 use super::dataset::Dataset;
 use super::figures::extent_of;
 use super::methods::{FrameError, headline, methods};
@@ -43,7 +44,6 @@ pub struct Neighbour {
 pub struct Chosen {
     pub method: String,
     pub frames: Vec<FrameError>,
-    pub positions_m: Vec<PositionM>,
     /// Learning frames: recording and row, position.
     learning: Vec<Vec<((usize, usize), PositionM)>>,
 }
@@ -72,7 +72,9 @@ pub fn choose(dataset: &Dataset, surveys: &[Recording]) -> Option<Chosen> {
         if dataset.map.is_some() {
             let of = surveys.iter().enumerate();
             return of
-                .flat_map(|(i, recording)| recording.survey.iter().enumerate().map(move |(row, f)| ((i, row), f.position_m)))
+                .flat_map(|(i, recording)| {
+                    recording.survey.iter().enumerate().map(move |(row, f)| ((i, row), f.position_m))
+                })
                 .collect();
         }
         let shown = dataset.splits.iter().find(|shown| Some(&shown.name) == split.as_ref() && shown.seed == frame.seed);
@@ -84,8 +86,7 @@ pub fn choose(dataset: &Dataset, surveys: &[Recording]) -> Option<Chosen> {
         rows.map(|&row| ((0, row), dataset.frames[row].position_m)).collect()
     };
     let learning = errors.iter().map(learning_of).collect();
-    let positions_m = dataset.truth_m.clone();
-    Some(Chosen { method: method.label.clone(), frames: errors, positions_m, learning })
+    Some(Chosen { method: method.label.clone(), frames: errors, learning })
 }
 
 /// Reads the images of what was chosen, and of the frame at `shown_row`.
@@ -146,7 +147,8 @@ pub fn photographs(recording: &Recording, rows: &BTreeSet<usize>) -> Result<BTre
             Some(table) => table,
             None => {
                 let mut decoder = crate::jpeg::LumaDecoder::new();
-                let image = decoder.decode(&jpeg).map_err(|source| GalleryError::Frame { index: frame.index, source })?;
+                let image =
+                    decoder.decode(&jpeg).map_err(|source| GalleryError::Frame { index: frame.index, source })?;
                 table.insert(UnwrapTable::build(&donut, image.width_px, image.height_px)?)
             }
         };
@@ -178,7 +180,10 @@ pub fn html(dataset: &Dataset, chosen: &Chosen, worst: &[Worst]) -> String {
         match &one.at_truth {
             Some(near) => {
                 let apart_m = distance_m(near.position_m, one.frame.truth_m);
-                html += &panorama(&format!("nearest learning image, {} m from the truth ({})", meters(apart_m), near.name()), &near.photograph);
+                html += &panorama(
+                    &format!("nearest learning image, {} m from the truth ({})", meters(apart_m), near.name()),
+                    &near.photograph,
+                );
             }
             None if dataset.map.is_some() => {
                 html += "<p class=\"note\">A map holds no images: name the recordings it was learned from with --survey to see \
@@ -190,7 +195,10 @@ pub fn html(dataset: &Dataset, chosen: &Chosen, worst: &[Worst]) -> String {
             && one.at_truth.as_ref().is_none_or(|other| other.index != near.index)
         {
             let apart_m = distance_m(near.position_m, one.frame.estimate_m);
-            html += &panorama(&format!("learning image at the answer, {} m from it ({})", meters(apart_m), near.name()), &near.photograph);
+            html += &panorama(
+                &format!("learning image at the answer, {} m from it ({})", meters(apart_m), near.name()),
+                &near.photograph,
+            );
         }
         html += "</article>";
     }
@@ -212,17 +220,31 @@ fn panorama(what: &str, photograph: &Photograph) -> String {
     )
 }
 
+/// Where it was and where it was thought to be, with a bar for scale in place of axes.
 fn small_map(dataset: &Dataset, frame: &FrameError) -> String {
-    let mut plot = map_plot_of_width("", extent_of(dataset), Vec::new(), 300.0);
-    for &position_m in dataset.insights.iter().flat_map(|insight| &insight.learning_m) {
-        plot.dot(position_m, 1.2, Paint::fill(FAINT));
-    }
-    let (truth, estimate) = (plot.at(frame.truth_m), plot.at(frame.estimate_m));
-    plot.above.line(truth, estimate, Paint::stroke(VERMILION, 1.6));
-    plot.above.circle(truth, 5.0, Paint::fill("#ffffff").outlined(INK, 2.0));
-    plot.above.diamond(estimate, 6.0, Paint::fill(VERMILION).outlined("#ffffff", 1.0));
-    let panel = plot.finish();
-    document(panel.size_px, &panel.shapes, &format!("truth (ring) and estimate (diamond) of frame {}", frame.index))
+    const SIDE_PX: f64 = 240.0;
+    const BELOW_PX: f64 = 24.0;
+    let Extent { low_m, high_m } = extent_of(dataset);
+    let scale = SIDE_PX / (high_m[0] - low_m[0]).max(high_m[1] - low_m[1]);
+    let size = [(high_m[0] - low_m[0]) * scale, (high_m[1] - low_m[1]) * scale];
+    let at = |[e, n]: PositionM| [(e - low_m[0]) * scale, (high_m[1] - n) * scale];
+    let mut shapes = Shapes::default();
+    shapes.rect([0.0, 0.0], size, Paint::fill(PAPER).outlined(GRID, 1.0));
+    let learned = dataset.insights.first().map(|insight| &insight.learning_m[..]).unwrap_or_default();
+    learned.iter().for_each(|&position_m| shapes.circle(at(position_m), 1.2, Paint::fill(FAINT)));
+    let (truth, estimate) = (at(frame.truth_m), at(frame.estimate_m));
+    shapes.line(truth, estimate, Paint::stroke(VERMILION, 1.6));
+    shapes.circle(truth, 5.0, Paint::fill(PAPER).outlined(INK, 2.0));
+    shapes.diamond(estimate, 6.0, Paint::fill(VERMILION).outlined(PAPER, 1.0));
+    let bar_m = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0]
+        .into_iter()
+        .rfind(|bar_m| bar_m * scale < 0.4 * size[0])
+        .unwrap_or(0.1);
+    let y = size[1] + 12.0;
+    shapes.line([0.0, y], [bar_m * scale, y], Paint::stroke(INK, 2.0));
+    shapes.text([bar_m * scale + 6.0, y + 4.0], &format!("{bar_m} m"), NOTE);
+    let label = format!("truth (ring) and estimate (diamond) of frame {}", frame.index);
+    document([size[0] + 1.0, size[1] + BELOW_PX], &shapes, &label)
 }
 
 pub fn json(chosen: &Chosen, worst: &[Worst]) -> Value {

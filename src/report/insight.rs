@@ -170,7 +170,13 @@ impl Insight {
             .map(|(info, group)| GroupSurfaces {
                 descriptor: info.recipe.descriptor,
                 features: info.features,
-                shown: shown_surfaces(info.features, c, &group.field_mean, &group.field_variance, &info.hyperparameters),
+                shown: shown_surfaces(
+                    info.features,
+                    c,
+                    &group.field_mean,
+                    &group.field_variance,
+                    &info.hyperparameters,
+                ),
             })
             .collect();
         Self {
@@ -195,7 +201,7 @@ fn surfaces_of(group: &LearnedGroup, cells: usize, mean: &[f32], variance: &[f32
     }
 }
 
-/// The features that vary most over the cells, by what their noise is: those that tell most about the place.
+/// The features that tell most about the place: whose mean varies most over the cells, by their mean variance.
 fn shown_surfaces(
     features: usize,
     cells: usize,
@@ -212,7 +218,8 @@ fn shown_surfaces(
         let values = &mean[r * cells..(r + 1) * cells];
         let center = values.iter().map(|&v| f64::from(v)).sum::<f64>() / cells as f64;
         let spread = values.iter().map(|&v| (f64::from(v) - center).powi(2)).sum::<f64>() / cells as f64;
-        spread / fitted(r).noise_std.powi(2)
+        let of_feature = if variance.len() == cells { variance } else { &variance[r * cells..(r + 1) * cells] };
+        spread / of_feature.iter().map(|&v| f64::from(v)).sum::<f64>()
     };
     let mut order: Vec<(f64, usize)> = (0..features).map(|r| (tells(r), r)).collect();
     order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));

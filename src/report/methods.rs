@@ -51,11 +51,11 @@ impl<'a> Method<'a> {
             (_, "median") => ("always the median".to_owned(), MUTED, Some("2 3"), Kind::Nothing),
             (Some(recipe), "fused") => {
                 let color = if recipe == "paper" { VERMILION } else { BLUE };
-                (format!("{recipe}, all features"), color, None, Kind::Whole)
+                (format!("{}, all features", recipe_name(recipe)), color, None, Kind::Whole)
             }
             (Some(recipe), of_type) => {
                 let color = if recipe == "paper" { ORANGE } else { SKY };
-                (format!("{recipe}, {}", feature_name(of_type)), color, type_dashes(of_type), Kind::Part)
+                (format!("{}, {}", recipe_name(recipe), feature_name(of_type)), color, type_dashes(of_type), Kind::Part)
             }
             (None, baseline) => {
                 let (name, color, dashes) = baseline_name(baseline);
@@ -117,10 +117,12 @@ pub fn methods<'a>(dataset: &'a Dataset, split: Option<&str>) -> Vec<Method<'a>>
     }
     // A recipe of one type of features stands for itself.
     for recipe in ["default", "paper"] {
-        let of_recipe = |method: &&mut Method| method.entries[0].recipe == Some(recipe) && method.entries[0].estimator == "single";
+        let of_recipe =
+            |method: &&mut Method| method.entries[0].recipe == Some(recipe) && method.entries[0].estimator == "single";
         let mut own: Vec<&mut Method> = methods.iter_mut().filter(of_recipe).collect();
         if let [only] = &mut own[..] {
             only.kind = Kind::Whole;
+            only.dashes = None;
             only.color = if recipe == "paper" { VERMILION } else { BLUE };
         }
     }
@@ -131,7 +133,19 @@ pub fn methods<'a>(dataset: &'a Dataset, split: Option<&str>) -> Vec<Method<'a>>
 /// The method that a report is about: what `localize` would say, frame by frame.
 pub fn headline<'a, 'b>(methods: &'b [Method<'a>]) -> Option<&'b Method<'a>> {
     let whole = |method: &&Method| method.kind == Kind::Whole && method.entries[0].estimator == "single";
-    methods.iter().find(|method| whole(method) && method.entries[0].recipe == Some("default")).or_else(|| methods.iter().find(whole))
+    methods
+        .iter()
+        .find(|method| whole(method) && method.entries[0].recipe == Some("default"))
+        .or_else(|| methods.iter().find(whole))
+}
+
+/// A recipe in words.
+pub fn recipe_name(recipe: &str) -> &str {
+    match recipe {
+        "paper" => "paper’s recipe",
+        "default" => "default recipe",
+        other => other,
+    }
 }
 
 /// A feature type in words.
@@ -181,14 +195,19 @@ mod tests {
 
     #[test]
     fn every_result_has_a_name_and_its_place() {
-        let entry = |recipe, features: &str| Entry { recipe, features: features.into(), estimator: "single", ..Entry::default() };
+        let entry = |recipe, features: &str| Entry {
+            recipe,
+            features: features.into(),
+            estimator: "single",
+            ..Entry::default()
+        };
         let of = |entry: &Entry| {
             let method = Method::of(entry);
             (method.label, method.kind)
         };
         for (recipe, features, label, kind) in [
-            (Some("paper"), "fused", "paper, all features", Kind::Whole),
-            (Some("paper"), "sp", "paper, steerable pyramid", Kind::Part),
+            (Some("paper"), "fused", "paper’s recipe, all features", Kind::Whole),
+            (Some("paper"), "sp", "paper’s recipe, steerable pyramid", Kind::Part),
             (None, "bow", "bag of words, paper’s rule", Kind::Baseline),
             (None, "something new", "something new", Kind::Baseline),
             (None, "median", "always the median", Kind::Nothing),

@@ -238,7 +238,8 @@ mod tests {
 
     #[test]
     fn the_command_can_be_pasted_into_a_shell() {
-        let line = report(&["omniloc", "evaluate", "my drive.mcap", "--split=a,b", "it's", "", "$(reboot)"]).command_line();
+        let line =
+            report(&["omniloc", "evaluate", "my drive.mcap", "--split=a,b", "it's", "", "$(reboot)"]).command_line();
         assert_eq!(line, r"omniloc evaluate 'my drive.mcap' --split=a,b 'it'\''s' '' '$(reboot)'");
     }
 

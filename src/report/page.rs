@@ -9,7 +9,7 @@ use super::chart::plot::Panel;
 use super::chart::scale::{meters, number};
 use super::chart::svg::{document, escaped};
 use super::dataset::{Dataset, Provenance};
-use super::figure::{Drawn, Figure};
+use super::figure::{Drawn, Figure, capitalized};
 use super::figures::{cases, recall_at};
 use super::methods::{Kind, Method, headline, methods};
 use super::{Part, gallery};
@@ -45,7 +45,8 @@ pub fn html(report: &Report, parts: &[Part]) -> String {
     for dataset in &report.datasets {
         let _ = write!(page, "<a href=\"#{}\">{}</a>", dataset.id, escaped(&dataset.name));
     }
-    page += "<a href=\"#method\">What was done</a><a href=\"#provenance\">Data and settings</a></nav></div></header><main>";
+    page +=
+        "<a href=\"#method\">What was done</a><a href=\"#provenance\">Data and settings</a></nav></div></header><main>";
     for (dataset, part) in report.datasets.iter().zip(parts) {
         put_dataset(&mut page, dataset, part);
     }
@@ -78,21 +79,31 @@ fn put_dataset(page: &mut String, dataset: &Dataset, part: &Part) {
 
 /// What matters most, in words and large numbers.
 fn put_glance(page: &mut String, dataset: &Dataset) {
+    let yardstick = dataset.yardstick();
+    let percent = |share: f64| format!("{} %", number(100.0 * share, 1));
+    let over = |method: &Method, gross_m: f64| {
+        let errors_m = method.sorted_errors_m();
+        errors_m.iter().filter(|&&error_m| error_m > gross_m).count() as f64 / errors_m.len().max(1) as f64
+    };
     for (split, case) in cases(dataset) {
         let all = methods(dataset, split.as_deref());
         let Some(method) = headline(&all) else { continue };
         *page += &format!("<p class=\"lead\">{}</p>", escaped(&in_words(method, &all, &case)));
-        let cards = [
+        let cards: [(&str, Option<String>); 6] = [
             ("median error", method.mean(|e| e.median_m).map(|v| format!("{} m", meters(v)))),
             ("root mean square error", method.mean(|e| e.rmse_m).map(|v| format!("{} m", meters(v)))),
             ("95 % of the errors are below", method.mean(|e| e.p95_m).map(|v| format!("{} m", meters(v)))),
-            ("found within 2 m", Some(format!("{} %", number(100.0 * recall_at(method, 2.0), 1)))),
-            ("errors over 10 m", method.mean(|e| e.share_over_10m).map(|v| format!("{} %", number(100.0 * v, 1)))),
+            (&format!("found within {} m", yardstick.near_m), Some(percent(recall_at(method, yardstick.near_m)))),
+            (&format!("errors over {} m", yardstick.gross_m), Some(percent(over(method, yardstick.gross_m)))),
             ("skill: 1 is perfect, 0 knows nothing", method.mean(|e| e.skill).map(|v| number(v, 2))),
         ];
         *page += "<div class=\"cards\">";
         for (what, value) in cards {
-            let _ = write!(page, "<div class=\"card\"><b>{}</b><span>{what}</span></div>", value.unwrap_or_else(|| "–".into()));
+            let _ = write!(
+                page,
+                "<div class=\"card\"><b>{}</b><span>{what}</span></div>",
+                value.unwrap_or_else(|| "–".into())
+            );
         }
         *page += "</div>";
     }
@@ -107,20 +118,17 @@ fn in_words(method: &Method, all: &[Method], case: &str) -> String {
         _ => format!("{}, {n_test} test frames over {seeds} seeds: ", capitalized(case)),
     };
     let rmse = |method: &Method| method.mean(|e| e.rmse_m).map(meters).unwrap_or_else(|| "–".into());
-    let _ = write!(text, "RMSE {} m by {}", rmse(method), method.label);
+    let _ = write!(text, "an RMSE of {} m with the {}", rmse(method), method.label);
     let others = all.iter().filter(|other| {
-        other.label != method.label && matches!(other.kind, Kind::Whole | Kind::Nothing | Kind::Baseline) && other.mean(|e| e.rmse_m).is_some()
+        other.label != method.label
+            && matches!(other.kind, Kind::Whole | Kind::Nothing | Kind::Baseline)
+            && other.mean(|e| e.rmse_m).is_some()
     });
-    let named: Vec<String> = others.map(|other| format!("{} {}", rmse(other), other.label)).collect();
+    let named: Vec<String> = others.map(|other| format!("{} m {}", rmse(other), other.label)).collect();
     if !named.is_empty() {
-        let _ = write!(text, "; beside it {}", named.join(", "));
+        let _ = write!(text, ". To compare: {}", named.join(", "));
     }
     text + "."
-}
-
-fn capitalized(text: &str) -> String {
-    let mut characters = text.chars();
-    characters.next().map_or(String::new(), |first| first.to_uppercase().chain(characters).collect())
 }
 
 fn put_drawn(page: &mut String, drawn: &Drawn) {
@@ -203,7 +211,8 @@ fn put_provenance(page: &mut String, report: &Report) {
         if let Some(map) = &dataset.map {
             let info = &map.info;
             let recordings = info.recordings.iter().map(|r| format!("{} ({} frames)", r.name, r.frames));
-            let groups = info.groups.iter().map(|group| format!("{} ({} features)", group.recipe.descriptor, group.features));
+            let groups =
+                info.groups.iter().map(|group| format!("{} ({} features)", group.recipe.descriptor, group.features));
             let selection = match info.selection {
                 Selection::None => "none",
                 Selection::Backward => "backward elimination",
@@ -228,7 +237,8 @@ fn put_provenance(page: &mut String, report: &Report) {
         if !dataset.provenance.metadata.is_empty() {
             *page += "<details><summary>Metadata of the recording</summary>";
             let rows = dataset.provenance.metadata.iter();
-            let rows: Vec<(String, String)> = rows.map(|(record, key, value)| (format!("{record}: {key}"), value.clone())).collect();
+            let rows: Vec<(String, String)> =
+                rows.map(|(record, key, value)| (format!("{record}: {key}"), value.clone())).collect();
             put_facts(page, &rows.iter().map(|(key, value)| (key.as_str(), value.clone())).collect::<Vec<_>>());
             *page += "</details>";
         }
@@ -244,13 +254,23 @@ pub fn facts_of(facts: &Provenance) -> Vec<(&'static str, String)> {
         ("file", facts.path.clone()),
         ("SHA-256", facts.sha256.clone()),
         ("frames", format!("{}, {} more not usable", number(facts.frames as f64, 0), facts.unusable)),
-        ("way", format!("{} m, within {} × {} m", number(facts.length_m, 0), number(facts.extent_m[0], 1), number(facts.extent_m[1], 1))),
+        (
+            "way",
+            format!(
+                "{} m, within {} × {} m",
+                number(facts.length_m, 0),
+                number(facts.extent_m[0], 1),
+                number(facts.extent_m[1], 1)
+            ),
+        ),
     ];
     rows.push(("time", facts.duration_s.map_or("not known".into(), |s| format!("{} s", number(s, 0)))));
     rows.push((
         "positions",
         match facts.position_std_m {
-            Some(std_m) => format!("stated to be good to {std_m:.2} m on either axis (median of the standard deviations)"),
+            Some(std_m) => {
+                format!("stated to be good to {std_m:.2} m on either axis (median of the standard deviations)")
+            }
             None => "their accuracy is not stated".into(),
         },
     ));

@@ -5,6 +5,7 @@ use image::{GrayImage, RgbImage};
 use realfft::num_complex::Complex;
 
 use super::chart::picture::{gray_jpeg_address, rgb_jpeg_address};
+use crate::features::{Describer, Descriptor};
 use crate::jpeg::{JpegError, LumaDecoder};
 use crate::panorama::{GRAY_SIZE, Panorama, UnwrapTable, WIDE_COLUMNS, WIDE_ROWS};
 use crate::types::DonutCalibration;
@@ -21,8 +22,9 @@ pub struct Photograph {
     pub rims: [f64; 4],
     /// 512 × 128.
     pub panorama: String,
-    /// The f\[a, b\] of the paper.
+    /// The f\[a, b\] of the paper, and its FFT properties.
     pub gray: Vec<f32>,
+    pub fft: Vec<f32>,
 }
 
 impl Photograph {
@@ -40,6 +42,8 @@ impl Photograph {
         // What the properties are of is the panorama as it is; to be compared by eye, all look the same way.
         table.unwrap_into(luma, 0, &mut panorama);
         let gray = panorama.gray.clone();
+        let mut fft = Describer::room_for(&[Descriptor::Fft]);
+        Describer::new().describe(&[Descriptor::Fft], &panorama, &mut fft);
         table.unwrap_into(luma, turned, &mut panorama);
         let wide: Vec<u8> = panorama.wide.iter().map(|&value| value.round() as u8).collect();
         let (width, height) = (luma.width_px as u32, luma.height_px as u32);
@@ -57,6 +61,7 @@ impl Photograph {
             rims,
             panorama: gray_jpeg_address(&wide, WIDE_COLUMNS, WIDE_ROWS),
             gray,
+            fft: fft.concat(),
         })
     }
 }

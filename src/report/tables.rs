@@ -169,7 +169,10 @@ fn paper_shape(dataset: &Dataset) -> Table {
         let key = (first.split.clone(), recipe);
         let begins = (before.as_ref() != Some(&key)).then(|| {
             let split = first.split.clone().unwrap_or_default();
-            format!("{recipe} recipe, {split} split: {} learning, {} validation, {} test images", first.n_learning, first.n_validation, first.n_test)
+            format!(
+                "{recipe} recipe, {split} split: {} learning, {} validation, {} test images",
+                first.n_learning, first.n_validation, first.n_test
+            )
         });
         before = Some(key);
         let count = |of: fn(&Entry) -> Option<usize>| mean(&group, |entry| of(entry).map(|n| n as f64));
@@ -224,7 +227,8 @@ fn paper_shape(dataset: &Dataset) -> Table {
 /// Table 3 of Do et al. (2015): the recipes beside bags of words, with images as they are and turned by their yaw.
 fn against_words(dataset: &Dataset) -> Option<Table> {
     let split = dataset.split_names().into_iter().next()?;
-    let of_split: Vec<Entry> = dataset.entries.iter().filter(|e| e.split.as_deref() == Some(&split) && !e.noisy).cloned().collect();
+    let of_split: Vec<Entry> =
+        dataset.entries.iter().filter(|e| e.split.as_deref() == Some(&split) && !e.noisy).cloned().collect();
     let is_words = |entry: &Entry| entry.features.starts_with("bow");
     let mut rows = Vec::new();
     let groups = grouped(&of_split);
@@ -234,14 +238,13 @@ fn against_words(dataset: &Dataset) -> Option<Table> {
         if !words && first.recipe.is_none() {
             continue;
         }
-        let fixed = groups.iter().find(|other| {
-            other[0].fixed && other[0].recipe == first.recipe && other[0].features == first.features
-        });
-        let of = |group: Option<&Vec<&Entry>>, of: &dyn Fn(&Entry) -> Option<f64>| group.and_then(|group| mean(group, of));
-        let (kept, fixed_kept) = (
-            of(Some(group), &|e| e.kept.map(|n| n as f64)),
-            of(fixed, &|e| e.kept.map(|n| n as f64)),
-        );
+        let fixed = groups
+            .iter()
+            .find(|other| other[0].fixed && other[0].recipe == first.recipe && other[0].features == first.features);
+        let of =
+            |group: Option<&Vec<&Entry>>, of: &dyn Fn(&Entry) -> Option<f64>| group.and_then(|group| mean(group, of));
+        let (kept, fixed_kept) =
+            (of(Some(group), &|e| e.kept.map(|n| n as f64)), of(fixed, &|e| e.kept.map(|n| n as f64)));
         let (rmse, fixed_rmse) = (of(Some(group), &|e| e.rmse_m), of(fixed, &|e| e.rmse_m));
         let mine = |value: Option<f64>, belongs: bool| Cell::meters(value.filter(|_| belongs));
         let label = match first.recipe {
@@ -332,7 +335,8 @@ fn accuracy(dataset: &Dataset) -> Table {
                 ]);
             }
             let seeds = method.entries.len();
-            let begins = format!("{case}{}", if seeds > 1 { format!(", mean over {seeds} seeds") } else { String::new() });
+            let begins =
+                format!("{case}{}", if seeds > 1 { format!(", mean over {seeds} seeds") } else { String::new() });
             rows.push(Row {
                 label: method.label.clone(),
                 begins_group: (i == 0).then_some(begins),

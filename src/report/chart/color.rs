@@ -19,9 +19,6 @@ pub const PURPLE: &str = "#b2588f";
 pub const SKY: &str = "#56b4e9";
 pub const BLACK: &str = "#1b1f24";
 
-/// Of series that have no colour of their own.
-pub const SERIES: [&str; 7] = [BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, MUTED];
-
 pub type Rgb = [u8; 3];
 
 /// A colour map: 0 to 1.
@@ -92,27 +89,19 @@ impl ColorMap {
     }
 }
 
-/// Classes of errors on a map: up to so many metres, the colour, and how large the mark is. Brighter is worse, and larger.
+/// Classes of errors on a map, from small to gross: worse is warmer, and larger.
 pub const ERROR_CLASSES: [ErrorClass; 5] = [
-    ErrorClass { up_to_m: 1.0, label: "≤ 1 m", color: "#2c7fb8", radius_px: 2.6 },
-    ErrorClass { up_to_m: 2.0, label: "1–2 m", color: "#41b6c4", radius_px: 2.8 },
-    ErrorClass { up_to_m: 5.0, label: "2–5 m", color: "#f2b134", radius_px: 3.4 },
-    ErrorClass { up_to_m: 10.0, label: "5–10 m", color: "#e2621b", radius_px: 4.2 },
-    ErrorClass { up_to_m: f64::INFINITY, label: "> 10 m", color: "#a50026", radius_px: 5.0 },
+    ErrorClass { color: "#2c7fb8", radius_px: 2.6 },
+    ErrorClass { color: "#41b6c4", radius_px: 2.8 },
+    ErrorClass { color: "#f2b134", radius_px: 3.4 },
+    ErrorClass { color: "#e2621b", radius_px: 4.2 },
+    ErrorClass { color: "#a50026", radius_px: 5.0 },
 ];
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorClass {
-    pub up_to_m: f64,
-    pub label: &'static str,
     pub color: &'static str,
     pub radius_px: f64,
-}
-
-impl ErrorClass {
-    pub fn of(error_m: f64) -> &'static Self {
-        ERROR_CLASSES.iter().find(|class| error_m <= class.up_to_m).unwrap_or(&ERROR_CLASSES[4])
-    }
 }
 
 #[cfg(test)]
@@ -132,11 +121,5 @@ mod tests {
         let luma = |c: Rgb| 0.2126 * f64::from(c[0]) + 0.7152 * f64::from(c[1]) + 0.0722 * f64::from(c[2]);
         let values: Vec<f64> = (0..=40).map(|i| luma(ColorMap::Sequential.at(f64::from(i) / 40.0))).collect();
         assert!(values.is_sorted(), "{values:?}");
-    }
-
-    #[test]
-    fn errors_fall_into_their_classes() {
-        let labels = [0.0, 1.0, 1.5, 9.0, 10.1, f64::NAN].map(|error_m| ErrorClass::of(error_m).label);
-        assert_eq!(labels, ["≤ 1 m", "≤ 1 m", "1–2 m", "5–10 m", "> 10 m", "> 10 m"]);
     }
 }

@@ -2,7 +2,7 @@
 
 use super::color::{ColorMap, MUTED};
 use super::picture::{Rgba, png_address};
-use super::plot::{Axis, LegendItem, PANEL_WIDTH_PX, Plot, Spec, TICK};
+use super::plot::{Axis, LABEL, LegendItem, Plot, Spec, TICK};
 use super::scale::Scale;
 use super::svg::{Anchor, Paint};
 use crate::map::CandidateCells;
@@ -30,28 +30,20 @@ impl Extent {
         }
         let side_m = (high_m[0] - low_m[0]).max(high_m[1] - low_m[1]).max(1e-3);
         // A drive along a line is still shown as an area.
-        let margin_m = [0, 1].map(|axis: usize| 0.04 * side_m + 0.5 * (0.25 * side_m - high_m[axis] + low_m[axis]).max(0.0));
+        let margin_m =
+            [0, 1].map(|axis: usize| 0.04 * side_m + 0.5 * (0.25 * side_m - high_m[axis] + low_m[axis]).max(0.0));
         Self {
             low_m: [low_m[0] - margin_m[0], low_m[1] - margin_m[1]],
             high_m: [high_m[0] + margin_m[0], high_m[1] + margin_m[1]],
         }
     }
-
-    /// A square around a place.
-    pub fn around(center_m: PositionM, half_m: f64) -> Self {
-        Self { low_m: center_m.map(|c| c - half_m), high_m: center_m.map(|c| c + half_m) }
-    }
 }
 
 /// Plotting areas are at most so high \[px\].
-const MAX_HEIGHT_PX: f64 = 400.0;
+const MAX_HEIGHT_PX: f64 = 560.0;
 
 /// A plot of `extent`, with equal scales.
-pub fn map_plot(title: impl Into<String>, extent: Extent, legend: Vec<LegendItem>) -> Plot {
-    map_plot_of_width(title, extent, legend, PANEL_WIDTH_PX)
-}
-
-pub fn map_plot_of_width(title: impl Into<String>, extent: Extent, legend: Vec<LegendItem>, width_px: f64) -> Plot {
+pub fn map_plot(title: impl Into<String>, extent: Extent, legend: Vec<LegendItem>, width_px: f64) -> Plot {
     // As wide as the axis labels leave it; the plot then says how wide that is.
     let build = |extent: Extent, height_px: f64| {
         let x = Axis::new("east [m]", Scale::linear(extent.low_m[0], extent.high_m[0]));
@@ -65,7 +57,7 @@ pub fn map_plot_of_width(title: impl Into<String>, extent: Extent, legend: Vec<L
     let size_m = [0, 1].map(|axis: usize| extent.high_m[axis] - extent.low_m[axis]);
     let trial = Plot::new(build(extent, 200.0));
     let wide_px = trial.area_size[0];
-    let max_height_px = MAX_HEIGHT_PX.min(1.15 * wide_px);
+    let max_height_px = MAX_HEIGHT_PX.min(1.2 * wide_px);
     let height_px = (wide_px * size_m[1] / size_m[0]).min(max_height_px);
     let meters_a_px = (size_m[1] / height_px).max(size_m[0] / wide_px);
     let widened_m = 0.5 * (meters_a_px * wide_px - size_m[0]);
@@ -89,7 +81,13 @@ impl Plot {
     }
 
     /// The ellipse that holds `probability` of a normal distribution.
-    pub fn covariance_ellipse(&mut self, center_m: PositionM, covariance: &PositionCovariance, probability: f64, paint: Paint) {
+    pub fn covariance_ellipse(
+        &mut self,
+        center_m: PositionM,
+        covariance: &PositionCovariance,
+        probability: f64,
+        paint: Paint,
+    ) {
         let ([a_m, b_m], turn_rad) = ellipse_m(covariance, probability);
         let (at, scale) = (self.at(center_m), self.px_a_m());
         self.inside.ellipse(at, [a_m * scale, b_m * scale], turn_rad, paint);
@@ -113,27 +111,25 @@ impl Plot {
 
     /// What the colours of a surface mean, below the plot.
     pub fn color_bar(&mut self, label: &str, [low, high]: [f64; 2], map: ColorMap) {
-        let top = self.room_below(40.0) + 6.0;
+        let top = self.room_below(56.0) + 22.0;
         let (left, wide) = (self.area_at[0], self.area_size[0]);
         let mut strip = Rgba::transparent(128, 1);
         (0..128).for_each(|i| strip.put(i, 0, map.at(i as f64 / 127.0)));
         self.above.image([left, top], [wide, 9.0], &png_address(&strip), false);
         self.above.rect([left, top], [wide, 9.0], Paint::stroke(super::color::GRID, 1.0));
         let scale = Scale::linear(low, high).onto(left, left + wide);
-        let label_width = super::text::width_px(label, TICK.size_px, false);
         let mut free_from = left;
-        for tick in scale.ticks(4) {
+        for tick in scale.ticks(5) {
             let at = scale.px(tick.value);
             let half = 0.5 * super::text::width_px(&tick.label, TICK.size_px, false);
             let x = at.clamp(left + half, left + wide - half);
             self.above.line([at, top + 9.0], [at, top + 12.0], Paint::stroke(MUTED, 1.0));
-            // The label has the right end for itself.
-            if x + half < left + wide - label_width - 8.0 && x - half >= free_from {
+            if x - half >= free_from {
                 self.above.text([x, top + 23.0], &tick.label, TICK.anchored(Anchor::Middle));
                 free_from = x + half + 6.0;
             }
         }
-        self.above.text([left + wide, top + 23.0], label, TICK.anchored(Anchor::End));
+        self.above.text([left, top - 6.0], label, LABEL);
     }
 }
 
@@ -155,7 +151,7 @@ mod tests {
     #[test]
     fn a_meter_is_as_long_to_the_east_as_to_the_north() {
         for corner in [[100.0, 20.0], [10.0, 300.0], [5.0, 0.0], [0.0, 0.0]] {
-            let plot = map_plot("", Extent::of(&[[0.0, 0.0], corner]), Vec::new());
+            let plot = map_plot("", Extent::of(&[[0.0, 0.0], corner]), Vec::new(), 364.0);
             let north = (plot.y.from_px - plot.y.to_px) / (plot.y.high - plot.y.low);
             assert!((plot.px_a_m() / north - 1.0).abs() < 1e-9, "{corner:?}");
             let at = plot.at(corner);

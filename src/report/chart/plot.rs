@@ -132,9 +132,9 @@ impl Plot {
         let mut top = TITLE_HEIGHT_PX + LEGEND_ROW_PX * rows as f64;
         if !y.label.is_empty() {
             below.text([0.0, top + 11.0], &fitted(&y.label, LABEL.size_px, false, width), LABEL);
-            top += AXIS_LABEL_PX;
+            top += AXIS_LABEL_PX + 5.0;
         } else {
-            top += 6.0;
+            top += 8.0;
         }
         let area_at = [left, top];
         let area_size = [width - left - right, area_height_px];
@@ -243,10 +243,6 @@ impl Plot {
         let from = self.size_px[1];
         self.size_px[1] += height_px;
         from
-    }
-
-    pub fn width_px(&self) -> f64 {
-        self.size_px[0]
     }
 }
 

@@ -16,7 +16,9 @@ pub fn escaped(text: &str) -> String {
             '"' => safe.push_str("&quot;"),
             '\'' => safe.push_str("&#39;"),
             // No control character may be in XML, not even escaped, and what turns text around could fool a reader.
-            c if (c.is_control() && !matches!(c, '\n' | '\t')) || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{fffe}' | '\u{ffff}') => {
+            c if (c.is_control() && !matches!(c, '\n' | '\t'))
+                || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{fffe}' | '\u{ffff}') =>
+            {
                 safe.push('\u{fffd}');
             }
             c => safe.push(c),
@@ -120,10 +122,6 @@ impl Type {
 pub struct Shapes(String);
 
 impl Shapes {
-    pub fn as_str(&self) -> &str {
-        &self.0
-    }
-
     pub fn append(&mut self, other: &Self) {
         self.0 += &other.0;
     }
@@ -153,7 +151,8 @@ impl Shapes {
     }
 
     pub fn circle(&mut self, [x, y]: [f64; 2], radius_px: f64, paint: Paint) {
-        let _ = write!(self.0, "<circle cx=\"{}\" cy=\"{}\" r=\"{}\"{}/>", px(x), px(y), px(radius_px), paint.attributes());
+        let _ =
+            write!(self.0, "<circle cx=\"{}\" cy=\"{}\" r=\"{}\"{}/>", px(x), px(y), px(radius_px), paint.attributes());
     }
 
     /// A circle that says `title` where the pointer rests on it.
@@ -198,11 +197,6 @@ impl Shapes {
         self.put_text(at, text, style, "");
     }
 
-    /// A text that reads from below to above.
-    pub fn upright_text(&mut self, [x, y]: [f64; 2], text: &str, style: Type) {
-        self.put_text([x, y], text, style, &format!(" transform=\"rotate(-90 {} {})\"", px(x), px(y)));
-    }
-
     /// A text with a light rim, to be read on whatever lies below.
     pub fn haloed_text(&mut self, at: [f64; 2], text: &str, style: Type) {
         let halo = " stroke=\"#ffffff\" stroke-width=\"3\" stroke-linejoin=\"round\" paint-order=\"stroke\"";
@@ -229,7 +223,8 @@ impl Shapes {
 
     /// A picture, as a `data:` address, stretched over a rectangle; `sharp` shows its pixels as they are.
     pub fn image(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2], address: &str, sharp: bool) {
-        let rendering = if sharp { " style=\"image-rendering:pixelated\" image-rendering=\"optimizeSpeed\"" } else { "" };
+        let rendering =
+            if sharp { " style=\"image-rendering:pixelated\" image-rendering=\"optimizeSpeed\"" } else { "" };
         let _ = write!(
             self.0,
             "<image x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\" preserveAspectRatio=\"none\"{rendering} href=\"{}\"/>",

@@ -7,15 +7,17 @@ use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, Panel, Plot, Spec
 use crate::report::chart::scale::Scale;
 use crate::report::chart::svg::{Anchor, Paint};
 use crate::report::dataset::{Dataset, EliminationRun};
-use crate::report::figure::{Drawn, Figure};
+use crate::report::figure::{Drawn, Figure, capitalized};
 use crate::report::methods::feature_name;
 
 pub fn elimination(dataset: &Dataset) -> Drawn {
     const TITLE: &str = "Backward elimination";
     let Some(first) = dataset.eliminations.first() else {
         let why = match &dataset.map {
-            Some(_) => "A map holds the features that were kept, not how the others were removed: `evaluate` without --map \
-                        shows that.",
+            Some(_) => {
+                "A map holds the features that were kept, not how the others were removed: `evaluate` without --map \
+                        shows that."
+            }
             None => "No recipe that was run removes features one by one.",
         };
         return Drawn::left_out(TITLE, why);
@@ -27,10 +29,13 @@ pub fn elimination(dataset: &Dataset) -> Drawn {
             types.push(&run.features);
         }
     }
-    let panels = types.iter().map(|features| {
-        let runs: Vec<&EliminationRun> = of_split.iter().copied().filter(|run| run.features == *features).collect();
-        panel(features, &runs)
-    });
+    let panels = |width_px: f64| {
+        let of_type = |features: &&str| {
+            let runs: Vec<&EliminationRun> = of_split.iter().copied().filter(|run| run.features == *features).collect();
+            panel(features, &runs, width_px)
+        };
+        types.iter().map(of_type).collect()
+    };
     let data = dataset.eliminations.iter().map(|run| {
         let all = run.validation_rmse_m.len() - 1;
         json!({
@@ -50,22 +55,21 @@ pub fn elimination(dataset: &Dataset) -> Drawn {
         first.split
     );
     let figure = Figure::new(format!("{}-elimination", dataset.id), TITLE, caption, json!(data.collect::<Vec<_>>()));
-    figure.with_panels(panels.collect()).into()
+    figure.responsive(panels).into()
 }
 
-fn panel(features: &str, runs: &[&EliminationRun]) -> Panel {
+fn panel(features: &str, runs: &[&EliminationRun], width_px: f64) -> Panel {
     let most = runs.iter().map(|run| run.validation_rmse_m.len() - 1).max().unwrap_or(1) as f64;
-    let greatest = runs
-        .iter()
-        .flat_map(|run| run.validation_rmse_m.iter().chain(&run.test_rmse_m))
-        .copied()
-        .fold(0.0, f64::max);
+    let greatest =
+        runs.iter().flat_map(|run| run.validation_rmse_m.iter().chain(&run.test_rmse_m)).copied().fold(0.0, f64::max);
     // From many to few.
     let x = Axis::new("features kept", Scale::linear(-most, 0.0));
     let ticks = Scale::linear(0.0, most).ticks(5).into_iter().map(|tick| (-tick.value, tick.label));
     let x = x.with_ticks(ticks.collect::<Vec<_>>().into_iter().rev());
     let y = Axis::new("RMSE [m]", Scale::linear(0.0, 1.08 * greatest));
-    let mut spec = Spec::new(feature_name(features), x, y);
+    let mut spec = Spec::new(capitalized(&feature_name(features)), x, y);
+    spec.width_px = width_px;
+    spec.area_height_px = 240.0;
     spec.legend = vec![
         LegendItem::new("validation", Key::Line(Paint::stroke(BLUE, 2.4))),
         LegendItem::new("test", Key::Line(Paint::stroke(VERMILION, 2.4))),

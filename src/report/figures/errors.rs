@@ -2,17 +2,17 @@
 
 use serde_json::json;
 
-use crate::report::chart::color::{FAINT, INK};
-use crate::report::chart::plot::{Axis, HALF_WIDTH_PX, Key, LABEL, LegendItem, NOTE, PANEL_WIDTH_PX, Panel, Plot, Spec};
+use crate::evaluate::Entry;
+use crate::report::chart::color::{FAINT, INK, PAPER};
+use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, NOTE, Panel, Plot, Spec};
 use crate::report::chart::scale::{Scale, meters};
 use crate::report::chart::svg::{Anchor, Paint};
 use crate::report::chart::text::fitted;
 use crate::report::dataset::Dataset;
-use crate::report::figure::{Drawn, Figure};
+use crate::report::figure::{Drawn, Figure, capitalized};
 use crate::report::methods::{Kind, Method, methods};
-use crate::evaluate::Entry;
 
-/// Distances at which a frame counts as found \[m\].
+/// Distances at which a frame counts as found in the tables \[m\].
 pub const RECALL_AT_M: [f64; 4] = [1.0, 2.0, 5.0, 10.0];
 
 /// The splits of a dataset, or that it was measured against a map.
@@ -29,44 +29,52 @@ pub fn cases(dataset: &Dataset) -> Vec<(Option<String>, String)> {
     splits.iter().map(|split| (Some(split.clone()), named(split))).collect()
 }
 
+/// A case and its methods.
+fn methods_of_cases<'a>(dataset: &'a Dataset, shown: impl Fn(&Method) -> bool) -> Vec<(String, Vec<Method<'a>>)> {
+    let of_case = |(split, title): (Option<String>, String)| {
+        let mut methods = methods(dataset, split.as_deref());
+        methods.retain(|method| shown(method));
+        (capitalized(&title), methods)
+    };
+    cases(dataset).into_iter().map(of_case).filter(|(_, methods)| !methods.is_empty()).collect()
+}
+
 /// RMSE and median of every method, every seed a dot.
 pub fn comparison(dataset: &Dataset) -> Drawn {
-    let (mut panels, mut narrow) = (Vec::new(), Vec::new());
-    let mut data = Vec::new();
-    for (split, title) in cases(dataset) {
-        let methods = methods(dataset, split.as_deref());
-        let measured: Vec<&Method> = methods.iter().filter(|m| m.mean(|e| e.rmse_m).is_some()).collect();
-        if measured.is_empty() {
-            continue;
-        }
-        panels.push(comparison_panel(&title, &measured, HALF_WIDTH_PX));
-        narrow.push(comparison_panel(&title, &measured, PANEL_WIDTH_PX));
-        for method in measured {
-            data.push(json!({
-                "split": split,
-                "method": method.label,
-                "seeds": method.entries.iter().map(|entry| entry.seed).collect::<Vec<_>>(),
-                "rmse_m": method.entries.iter().map(|entry| entry.rmse_m).collect::<Vec<_>>(),
-                "median_m": method.entries.iter().map(|entry| entry.median_m).collect::<Vec<_>>(),
-                "rmse_mean_m": method.mean(|entry| entry.rmse_m),
-                "median_mean_m": method.mean(|entry| entry.median_m),
-            }));
-        }
+    const TITLE: &str = "How the methods compare";
+    let shown = methods_of_cases(dataset, |method| method.mean(|entry| entry.rmse_m).is_some());
+    if shown.is_empty() {
+        return Drawn::left_out(TITLE, "No method gave an estimate.");
     }
-    if panels.is_empty() {
-        return Drawn::left_out("How the methods compare", "No method gave an estimate.");
-    }
-    let seeds = dataset.entries.iter().filter_map(|entry| entry.seed).collect::<std::collections::BTreeSet<_>>().len();
-    let caption = match seeds {
-        0 | 1 => "Left is better. The bar runs from the median error (bar) to the root mean square error (diamond): a long \
-                  bar says that few gross errors make up most of the second.",
-        _ => "Left is better. Each dot is the RMSE of one seed of the split, the diamond their mean, the bar the mean of \
-              the median errors: a long way between bar and diamond says that few gross errors make up most of the RMSE.",
+    let of_method = |method: &Method| {
+        json!({
+            "split": method.entries[0].split,
+            "method": method.label,
+            "seeds": method.entries.iter().map(|entry| entry.seed).collect::<Vec<_>>(),
+            "rmse_m": method.entries.iter().map(|entry| entry.rmse_m).collect::<Vec<_>>(),
+            "median_m": method.entries.iter().map(|entry| entry.median_m).collect::<Vec<_>>(),
+            "rmse_mean_m": method.mean(|entry| entry.rmse_m),
+            "median_mean_m": method.mean(|entry| entry.median_m),
+        })
     };
-    let mut figure = Figure::new(format!("{}-comparison", dataset.id), "How the methods compare", caption, json!(data));
-    figure.columns = 2;
-    figure.narrow = narrow;
-    figure.with_panels(panels).into()
+    let data: Vec<_> = shown.iter().flat_map(|(_, methods)| methods.iter().map(of_method)).collect();
+    let caption = if shown.iter().all(|(_, methods)| methods.iter().all(|method| method.entries.len() == 1)) {
+        "Left is better. The line runs from the median error (bar) to the root mean square error (diamond): a long line says \
+         that few gross errors make up most of the second."
+    } else {
+        "Left is better. Each dot is the RMSE of one seed of the split, the diamond their mean, the bar the mean of the \
+         median errors: a long way between bar and diamond says that few gross errors make up most of the RMSE."
+    };
+    let figure = Figure::new(format!("{}-comparison", dataset.id), TITLE, caption, json!(data));
+    let panel = |width_px: f64| {
+        let of_case = |(title, methods): &(String, Vec<Method>)| comparison_panel(title, &refs(methods), width_px);
+        shown.iter().map(of_case).collect()
+    };
+    figure.halves(panel).into()
+}
+
+fn refs<'b, 'a>(methods: &'b [Method<'a>]) -> Vec<&'b Method<'a>> {
+    methods.iter().collect()
 }
 
 fn comparison_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
@@ -81,7 +89,7 @@ fn comparison_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
     let y = Axis::new("", Scale::linear(0.0, methods.len() as f64)).with_ticks([]);
     let mut spec = Spec::new(title, x, y);
     spec.width_px = width_px;
-    spec.area_height_px = ROW_PX * methods.len() as f64;
+    spec.area_height_px = ROW_PX * methods.len() as f64 + 6.0;
     spec.legend = vec![
         LegendItem::new("RMSE, mean", Key::Diamond(Paint::fill(INK))),
         LegendItem::new("RMSE of a seed", Key::Dot(Paint::fill(FAINT))),
@@ -96,7 +104,11 @@ fn comparison_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
         let [left, middle] = plot.at([plot.x.low, row]);
         let (Some(rmse_m), Some(median_m)) = (method.mean(|e| e.rmse_m), method.mean(|e| e.median_m)) else { continue };
         // The name stands above its line, so that it may be as long as it is.
-        plot.above.haloed_text([left + 4.0, middle - 5.0], &fitted(&method.label, NOTE.size_px, false, width_px - 110.0), NOTE);
+        plot.above.haloed_text(
+            [left + 4.0, middle - 5.0],
+            &fitted(&method.label, NOTE.size_px, false, width_px - 110.0),
+            NOTE,
+        );
         let at = |value: f64| [value, row - 0.16];
         plot.segment(at(median_m), at(rmse_m), Paint::stroke(method.color, 2.0).opacity(0.5));
         let [x, y] = plot.at(at(median_m));
@@ -119,41 +131,39 @@ fn comparison_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
 
 /// Share of the frames with at most such an error.
 pub fn distribution(dataset: &Dataset) -> Drawn {
-    let (mut panels, mut narrow) = (Vec::new(), Vec::new());
-    let mut data = Vec::new();
-    for (split, title) in cases(dataset) {
-        let all = methods(dataset, split.as_deref());
-        let whole = |m: &&Method| m.kind != Kind::Part;
-        let parts = |m: &&Method| m.kind == Kind::Part || m.kind == Kind::Whole && m.entries[0].estimator == "single";
-        let sets: [(String, Vec<&Method>); 2] = [
-            (format!("Methods: {title}"), all.iter().filter(whole).collect()),
-            (format!("Feature types: {title}"), all.iter().filter(parts).collect()),
-        ];
-        for (i, (title, methods)) in sets.into_iter().enumerate() {
-            if methods.iter().all(|m| m.sorted_errors_m().is_empty()) || i == 1 && !all.iter().any(|m| m.kind == Kind::Part) {
-                continue;
-            }
-            panels.push(distribution_panel(&title, &methods, HALF_WIDTH_PX));
-            narrow.push(distribution_panel(&title, &methods, PANEL_WIDTH_PX));
-        }
-        for method in &all {
-            data.push(json!({
-                "split": split,
-                "method": method.label,
-                "errors_m": method.sorted_errors_m(),
-                "frames": frames_of(method),
-            }));
-        }
+    const TITLE: &str = "Distribution of the errors";
+    let shown = methods_of_cases(dataset, |method| frames_of(method) > 0);
+    if shown.is_empty() {
+        return Drawn::left_out(TITLE, "No method gave an estimate.");
     }
-    if panels.is_empty() {
-        return Drawn::left_out("Distribution of the errors", "No method gave an estimate.");
-    }
+    let of_method = |method: &Method| {
+        json!({
+            "split": method.entries[0].split,
+            "method": method.label,
+            "errors_m": method.sorted_errors_m(),
+            "frames": frames_of(method),
+        })
+    };
+    let data: Vec<_> = shown.iter().flat_map(|(_, methods)| methods.iter().map(of_method)).collect();
+    let whole = |method: &&Method| method.kind != Kind::Part;
+    let is_single = |method: &Method| method.entries[0].estimator == "single";
+    let parts = |method: &&Method| method.kind == Kind::Part || method.kind == Kind::Whole && is_single(method);
+    let has_parts = shown.iter().any(|(_, methods)| methods.iter().any(|method| method.kind == Kind::Part));
+    let panels = |width_px: f64| {
+        let mut panels = Vec::new();
+        for (title, methods) in &shown {
+            panels.push(distribution_panel(title, &methods.iter().filter(whole).collect::<Vec<_>>(), width_px));
+        }
+        for (title, methods) in shown.iter().filter(|_| has_parts) {
+            let title = format!("{title}: feature types");
+            panels.push(distribution_panel(&title, &methods.iter().filter(parts).collect::<Vec<_>>(), width_px));
+        }
+        panels
+    };
     let caption = "The curve of a good method is high and to the left: at a given error (across) it has found a large share \
                    of the frames (up). Frames without an estimate count as not found. All seeds together.";
-    let mut figure = Figure::new(format!("{}-distribution", dataset.id), "Distribution of the errors", caption, json!(data));
-    figure.columns = 2;
-    figure.narrow = narrow;
-    figure.with_panels(panels).into()
+    let figure = Figure::new(format!("{}-distribution", dataset.id), TITLE, caption, json!(data));
+    figure.halves(panels).into()
 }
 
 /// All frames, those without an estimate too.
@@ -189,44 +199,44 @@ fn distribution_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel 
         let errors_m = method.sorted_errors_m();
         let n = frames_of(method).max(errors_m.len()).max(1) as f64;
         let mut points = vec![[plot.x.low, errors_m.iter().filter(|&&e| e <= plot.x.low).count() as f64 / n]];
-        points.extend(errors_m.iter().enumerate().filter(|(_, e)| **e > plot.x.low).map(|(i, &e)| [e, (i + 1) as f64 / n]));
+        points.extend(
+            errors_m.iter().enumerate().filter(|(_, e)| **e > plot.x.low).map(|(i, &e)| [e, (i + 1) as f64 / n]),
+        );
         points.push([plot.x.high, errors_m.len() as f64 / n]);
         plot.staircase(&points, paint(method));
     }
     plot.finish()
 }
 
-/// Share of the frames found within 1, 2, 5 and 10 m.
+/// Share of the frames found within some distances.
 pub fn recall(dataset: &Dataset) -> Drawn {
-    let (mut panels, mut narrow) = (Vec::new(), Vec::new());
-    let mut data = Vec::new();
-    for (split, title) in cases(dataset) {
-        let methods = methods(dataset, split.as_deref());
-        let shown: Vec<&Method> = methods.iter().filter(|m| m.kind != Kind::Part && frames_of(m) > 0).collect();
-        if shown.is_empty() {
-            continue;
-        }
-        panels.push(recall_panel(&title, &shown, HALF_WIDTH_PX));
-        narrow.push(recall_panel(&title, &shown, PANEL_WIDTH_PX));
-        for method in &shown {
-            data.push(json!({
-                "split": split,
-                "method": method.label,
-                "at_m": RECALL_AT_M,
-                "recall": RECALL_AT_M.map(|at_m| recall_at(method, at_m)),
-                "frames": frames_of(method),
-            }));
-        }
+    const TITLE: &str = "Recall";
+    let at_m = dataset.yardstick().recall_m;
+    let shown = methods_of_cases(dataset, |method| method.kind != Kind::Part && frames_of(method) > 0);
+    if shown.is_empty() {
+        return Drawn::left_out(TITLE, "No method gave an estimate.");
     }
-    if panels.is_empty() {
-        return Drawn::left_out("Recall", "No method gave an estimate.");
-    }
-    let caption = "Share of all test frames whose estimate is at most so far from the truth; place recognition is usually \
-                   measured so. All seeds together.";
-    let mut figure = Figure::new(format!("{}-recall", dataset.id), "Recall at 1, 2, 5 and 10 m", caption, json!(data));
-    figure.columns = 2;
-    figure.narrow = narrow;
-    figure.with_panels(panels).into()
+    let of_method = |method: &Method| {
+        json!({
+            "split": method.entries[0].split,
+            "method": method.label,
+            "at_m": at_m,
+            "recall": at_m.map(|at_m| recall_at(method, at_m)),
+            "frames": frames_of(method),
+        })
+    };
+    let data: Vec<_> = shown.iter().flat_map(|(_, methods)| methods.iter().map(of_method)).collect();
+    let [a, b, c, d] = at_m;
+    let caption = format!(
+        "Share of all test frames whose estimate is within {a}, {b}, {c} and {d} m of the truth, from the darkest part of \
+         each bar to the lightest; place recognition is usually measured so. All seeds together."
+    );
+    let figure = Figure::new(format!("{}-recall", dataset.id), TITLE, caption, json!(data));
+    let panels = |width_px: f64| {
+        let of_case = |(title, methods): &(String, Vec<Method>)| recall_panel(title, &refs(methods), at_m, width_px);
+        shown.iter().map(of_case).collect()
+    };
+    figure.halves(panels).into()
 }
 
 pub fn recall_at(method: &Method, at_m: f64) -> f64 {
@@ -234,7 +244,7 @@ pub fn recall_at(method: &Method, at_m: f64) -> f64 {
     found as f64 / frames_of(method).max(1) as f64
 }
 
-fn recall_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
+fn recall_panel(title: &str, methods: &[&Method], at_m: [f64; 4], width_px: f64) -> Panel {
     const BAR_PX: f64 = 30.0;
     let percent = [0.0, 0.25, 0.5, 0.75, 1.0].map(|v| (v, format!("{:.0} %", 100.0 * v)));
     let x = Axis::new("share of the test frames", Scale::linear(0.0, 1.0)).with_ticks(percent);
@@ -244,20 +254,28 @@ fn recall_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
     let shade = |i: usize| [0.25, 0.45, 0.7, 1.0][i];
     // From the widest, so that the strictest lies on top.
     let key = |(i, at_m): (usize, &f64)| {
-        LegendItem::new(format!("within {at_m:.0} m"), Key::Box(Paint::fill(INK).opacity(shade(3 - i))))
+        LegendItem::new(format!("within {at_m} m"), Key::Box(Paint::fill(INK).opacity(shade(3 - i))))
     };
-    spec.legend = RECALL_AT_M.iter().enumerate().map(key).collect();
+    spec.legend = at_m.iter().enumerate().map(key).collect();
     let mut plot = Plot::new(spec);
     for (i, method) in methods.iter().enumerate() {
         let row = methods.len() as f64 - i as f64 - 0.5;
         let [left, middle] = plot.at([0.0, row]);
-        for (k, &at_m) in RECALL_AT_M.iter().enumerate().rev() {
+        for (k, &at_m) in at_m.iter().enumerate().rev() {
             let right = plot.x.px(recall_at(method, at_m));
-            plot.inside.rect([left, middle + 1.0], [right - left, 8.0], Paint::fill(super::super::chart::color::PAPER));
-            plot.inside.rect([left, middle + 1.0], [right - left, 8.0], Paint::fill(method.color).opacity(shade(3 - k)));
+            plot.inside.rect([left, middle + 1.0], [right - left, 8.0], Paint::fill(PAPER));
+            plot.inside.rect(
+                [left, middle + 1.0],
+                [right - left, 8.0],
+                Paint::fill(method.color).opacity(shade(3 - k)),
+            );
         }
-        plot.above.haloed_text([left + 2.0, middle - 3.0], &fitted(&method.label, NOTE.size_px, false, width_px - 130.0), NOTE);
-        let shares = RECALL_AT_M.map(|at_m| format!("{:.0}", 100.0 * recall_at(method, at_m))).join(" · ");
+        plot.above.haloed_text(
+            [left + 2.0, middle - 3.0],
+            &fitted(&method.label, NOTE.size_px, false, width_px - 130.0),
+            NOTE,
+        );
+        let shares = at_m.map(|at_m| format!("{:.0}", 100.0 * recall_at(method, at_m))).join(" · ");
         let right = plot.area_at[0] + plot.area_size[0];
         plot.above.haloed_text([right, middle - 3.0], &format!("{shares} %"), LABEL.anchored(Anchor::End));
     }

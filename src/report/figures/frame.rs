@@ -3,10 +3,10 @@
 use serde_json::json;
 
 use crate::panorama::{GRAY_SIZE, WIDE_COLUMNS, WIDE_ROWS};
-use crate::report::chart::color::{ColorMap, ORANGE};
+use crate::report::chart::color::{BLUE, ColorMap, ORANGE, VERMILION};
 use crate::report::chart::picture::{Rgba, png_address};
-use crate::report::chart::plot::{Axis, LABEL, PANEL_WIDTH_PX, Panel, Plot, Spec};
-use crate::report::chart::scale::Scale;
+use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, Panel, Plot, Spec};
+use crate::report::chart::scale::{Scale, number};
 use crate::report::chart::svg::{Anchor, Paint, Shapes};
 use crate::report::dataset::Dataset;
 use crate::report::figure::{Drawn, Figure};
@@ -27,6 +27,7 @@ pub fn frame(dataset: &Dataset) -> Drawn {
     let spectrum = log_spectrum(&photograph.gray);
     let low = f64::from(spectrum.iter().copied().fold(f32::INFINITY, f32::min));
     let high = f64::from(spectrum.iter().copied().fold(f32::NEG_INFINITY, f32::max));
+    let fft = photograph.fft.clone();
     let donut = &dataset.provenance.calibration;
     let data = json!({
         "index": index,
@@ -38,74 +39,108 @@ pub fn frame(dataset: &Dataset) -> Drawn {
         },
         "gray_128x128": photograph.gray,
         "log10_magnitude_128x128": spectrum,
+        "fft_properties": fft,
     });
     let caption = format!(
-        "Frame {index}. (a) what the camera saw, with the calibrated rims of the donut; (b) the same unwrapped to a \
-         panorama; (c) reduced to the 128 × 128 gray values f[a, b] of the paper; (d) the magnitude of their \
-         two-dimensional Fourier transform, on whose two axes the paper’s FFT properties lie."
+        "Frame {index}. (a) what the camera saw; (b) the same unwrapped to a panorama (turned to begin in the east where \
+         the yaw is known), and below it the 128 numbers that are the paper’s FFT properties; (c) the panorama as it came, \
+         reduced to the 128 × 128 gray values f[a, b] of the paper; (d) the magnitude of their two-dimensional Fourier \
+         transform, on whose axes (dashed) those properties lie."
     );
     let mut figure = Figure::new(format!("{}-frame", dataset.id), TITLE, caption, data);
-    figure.columns = 2;
+    figure.columns = 4;
+    let mut gray =
+        square_plot("(c) 128 × 128 gray image", &photograph.gray, [0.0, 255.0], ColorMap::Gray, Marks::Pixels);
+    gray.color_bar("gray value", [0.0, 255.0], ColorMap::Gray);
     let panels = vec![
         donut_panel(photograph),
-        panorama_panel(photograph, dataset.frames[row].yaw_rad.is_some()),
-        square_panel("(c) 128 × 128 gray image", "column b", "row a", &photograph.gray, [0.0, 255.0], ColorMap::Gray),
+        panorama_panel(photograph, &fft),
+        gray.finish(),
         spectrum_panel(&spectrum, [low, high]),
     ];
     figure.with_panels(panels).into()
 }
 
+/// Four beside one another on a desk.
+const WIDTH_PX: f64 = 266.0;
+
 fn donut_panel(photograph: &Photograph) -> Panel {
-    const SIDE_PX: f64 = 330.0;
     let mut shapes = Shapes::default();
     shapes.text([0.0, 14.0], "(a) camera image", crate::report::chart::plot::TITLE);
-    let at = [0.5 * (PANEL_WIDTH_PX - SIDE_PX), 26.0];
-    shapes.image(at, [SIDE_PX, SIDE_PX], &photograph.donut, false);
-    let [x, y, inner, outer] = photograph.rims.map(|share| share * SIDE_PX);
+    let at = [0.0, 26.0];
+    shapes.image(at, [WIDTH_PX, WIDTH_PX], &photograph.donut, false);
+    let [x, y, inner, outer] = photograph.rims.map(|share| share * WIDTH_PX);
+    let center = [at[0] + x, at[1] + y];
     for radius in [inner, outer] {
-        shapes.circle([at[0] + x, at[1] + y], radius, Paint::stroke(ORANGE, 1.5).dashed("5 3"));
+        shapes.circle(center, radius, Paint::stroke(ORANGE, 1.5).dashed("5 3"));
     }
-    shapes.line([at[0] + x - 5.0, at[1] + y], [at[0] + x + 5.0, at[1] + y], Paint::stroke(ORANGE, 1.5));
-    shapes.line([at[0] + x, at[1] + y - 5.0], [at[0] + x, at[1] + y + 5.0], Paint::stroke(ORANGE, 1.5));
-    shapes.text(
-        [0.5 * PANEL_WIDTH_PX, at[1] + SIDE_PX + 16.0],
-        "dashed: inner and outer rim as calibrated",
-        LABEL.anchored(Anchor::Middle),
-    );
-    Panel { title: "camera image".into(), size_px: [PANEL_WIDTH_PX, at[1] + SIDE_PX + 24.0], shapes }
+    shapes.line([center[0] - 5.0, center[1]], [center[0] + 5.0, center[1]], Paint::stroke(ORANGE, 1.5));
+    shapes.line([center[0], center[1] - 5.0], [center[0], center[1] + 5.0], Paint::stroke(ORANGE, 1.5));
+    let below = at[1] + WIDTH_PX + 16.0;
+    shapes.text([0.5 * WIDTH_PX, below], "dashed: the rims as calibrated", LABEL.anchored(Anchor::Middle));
+    Panel { title: "camera image".into(), size_px: [WIDTH_PX, below + 8.0], shapes }
 }
 
-fn panorama_panel(photograph: &Photograph, has_yaw: bool) -> Panel {
-    let label = if has_yaw { "azimuth from east, counter-clockwise or clockwise as the lens has it [°]" } else { "azimuth [°]" };
-    let x = Axis::new(label, Scale::linear(0.0, 360.0));
-    let x = x.with_ticks((0..=4).map(|quarter| (90.0 * f64::from(quarter), format!("{}", 90 * quarter))));
-    let y = Axis::new("row", Scale::linear(WIDE_ROWS as f64, 0.0));
-    let y = Axis { scale: Scale { low: WIDE_ROWS as f64, high: 0.0, ..y.scale }, ..y };
-    let mut spec = Spec::new("(b) panorama", x, y.with_ticks([0.0, 64.0, 128.0].map(|v| (v, format!("{v:.0}")))));
-    spec.grid = false;
-    spec.area_height_px = (PANEL_WIDTH_PX - 44.0) * WIDE_ROWS as f64 / WIDE_COLUMNS as f64;
+/// The panorama, and below it the paper's properties.
+fn panorama_panel(photograph: &Photograph, fft: &[f32]) -> Panel {
+    const PICTURE_PX: f64 = WIDTH_PX * WIDE_ROWS as f64 / WIDE_COLUMNS as f64;
+    const PROPERTIES_TOP_PX: f64 = 26.0 + PICTURE_PX + 30.0;
+    let mut shapes = Shapes::default();
+    shapes.text([0.0, 14.0], "(b) panorama", crate::report::chart::plot::TITLE);
+    shapes.image([0.0, 26.0], [WIDTH_PX, PICTURE_PX], &photograph.panorama, false);
+    let ends = [(0.0, "0°", Anchor::Start), (0.5, "180°", Anchor::Middle), (1.0, "360°", Anchor::End)];
+    for (share, text, anchor) in ends {
+        shapes.text([share * WIDTH_PX, 26.0 + PICTURE_PX + 14.0], text, LABEL.anchored(anchor));
+    }
+    let greatest = f64::from(fft.iter().copied().fold(1.0_f32, f32::max));
+    let least = f64::from(fft.iter().copied().fold(f32::INFINITY, f32::min)).max(1.0);
+    let x = Axis::new("frequency, cycles an image", Scale::linear(0.0, 64.0));
+    let y = Axis::new("magnitude, logarithmic", Scale::log(least, greatest));
+    let mut spec = Spec::new("The paper’s FFT properties of it", x, y);
+    spec.width_px = WIDTH_PX;
+    spec.area_height_px = 106.0;
+    let (down, along) = fft.split_at(fft.len() / 2);
+    spec.legend = vec![
+        LegendItem::new("|F(p, 0)|", Key::Line(Paint::stroke(VERMILION, 1.6))),
+        LegendItem::new("|F(0, l)|", Key::Line(Paint::stroke(BLUE, 1.6))),
+    ];
     let mut plot = Plot::new(spec);
-    let (at, size) = (plot.area_at, plot.area_size);
-    plot.inside.image(at, size, &photograph.panorama, false);
-    plot.finish()
+    for (values, color) in [(down, VERMILION), (along, BLUE)] {
+        let points: Vec<_> =
+            (1..).zip(values).map(|(harmonic, &v)| [f64::from(harmonic), f64::from(v).max(least)]).collect();
+        plot.curve(&points, Paint::stroke(color, 1.4));
+    }
+    let below = plot.finish();
+    shapes.moved([0.0, PROPERTIES_TOP_PX], &below.shapes);
+    Panel { title: "panorama".into(), size_px: [WIDTH_PX, PROPERTIES_TOP_PX + below.size_px[1]], shapes }
 }
 
-fn square_panel(title: &str, x: &str, y: &str, values: &[f32], range: [f64; 2], map: ColorMap) -> Panel {
-    square_plot(title, x, y, values, range, map).finish()
+/// What the axes of a square picture count.
+#[derive(Clone, Copy, PartialEq)]
+enum Marks {
+    Pixels,
+    Frequencies,
 }
 
-fn square_plot(title: &str, x: &str, y: &str, values: &[f32], [low, high]: [f64; 2], map: ColorMap) -> Plot {
+fn square_plot(title: &str, values: &[f32], [low, high]: [f64; 2], map: ColorMap, marks: Marks) -> Plot {
     let n = GRAY_SIZE as f64;
-    let ticks = || [0.0, 32.0, 64.0, 96.0, 128.0].map(|v| (v, format!("{v:.0}")));
+    let (x, y, from) = match marks {
+        Marks::Pixels => ("column b", "row a", 0.0),
+        Marks::Frequencies => ("frequency l, along the horizon", "frequency p, across the horizon", -0.5 * n),
+    };
+    let ticks = || (0..=4).map(move |i| 0.25 * n * f64::from(i)).map(move |v| (v, number(v + from, 0)));
     let x = Axis::new(x, Scale::linear(0.0, n)).with_ticks(ticks());
+    // Row 0 on top.
     let y = Axis::new(y, Scale { low: n, high: 0.0, ..Scale::linear(0.0, n) }).with_ticks(ticks());
     let mut spec = Spec::new(title, x, y);
     spec.grid = false;
-    spec.area_height_px = 290.0;
+    spec.width_px = WIDTH_PX;
+    spec.area_height_px = 220.0;
     let mut plot = Plot::new(spec);
     let mut picture = Rgba::transparent(GRAY_SIZE, GRAY_SIZE);
     for (i, &value) in values.iter().enumerate() {
-        picture.put(i % GRAY_SIZE, i / GRAY_SIZE, map.at((f64::from(value) - low) / (high - low).max(f64::MIN_POSITIVE)));
+        let share = (f64::from(value) - low) / (high - low).max(f64::MIN_POSITIVE);
+        picture.put(i % GRAY_SIZE, i / GRAY_SIZE, map.at(share));
     }
     let (at, size) = (plot.area_at, plot.area_size);
     plot.inside.image(at, size, &png_address(&picture), true);
@@ -113,14 +148,14 @@ fn square_plot(title: &str, x: &str, y: &str, values: &[f32], [low, high]: [f64;
 }
 
 fn spectrum_panel(spectrum: &[f32], range: [f64; 2]) -> Panel {
-    let half = GRAY_SIZE as f64 / 2.0;
-    let title = "(d) magnitude of its Fourier transform";
-    let mut plot = square_plot(title, "frequency l along the horizon", "frequency p across it", spectrum, range, ColorMap::Sequential);
+    let (low, high) = (range[0].max(range[1] - 5.0), range[1]);
+    let title = "(d) magnitude of its transform";
+    let mut plot = square_plot(title, spectrum, [low, high], ColorMap::Sequential, Marks::Frequencies);
     // The properties |F(p, 0)| and |F(0, l)|, p and l from 1 to 64.
-    let at = |x: f64, y: f64| [x, y];
-    for (from, to) in [(at(half + 1.0, half + 0.5), at(2.0 * half, half + 0.5)), (at(half + 0.5, half + 1.0), at(half + 0.5, 2.0 * half))] {
+    let (middle, end) = (0.5 * GRAY_SIZE as f64, GRAY_SIZE as f64);
+    for (from, to) in [([middle, middle], [end, middle]), ([middle, middle], [middle, end])] {
         plot.segment(from, to, Paint::stroke("#ffffff", 1.4).dashed("4 3"));
     }
-    plot.color_bar("log₁₀ |F|", range, ColorMap::Sequential);
+    plot.color_bar("log₁₀ |F(p, l)|", [low, high], ColorMap::Sequential);
     plot.finish()
 }

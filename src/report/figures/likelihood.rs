@@ -11,6 +11,7 @@ use crate::report::chart::svg::Paint;
 use crate::report::dataset::Dataset;
 use crate::report::figure::{Drawn, Figure};
 use crate::report::insight::{FrameAnswer, Insight};
+use crate::report::methods::recipe_name;
 
 /// Log-likelihoods further below the best than this are all drawn alike \[nats, at the map's temperature\].
 const SHOWN_NATS: f64 = 12.0;
@@ -42,8 +43,8 @@ pub fn likelihood(dataset: &Dataset) -> Drawn {
         })
     });
     let of = match &insight.split {
-        Some((split, Some(seed))) => format!("the {} recipe, {split} split, seed {seed}", insight.recipe),
-        Some((split, None)) => format!("the {} recipe, {split}", insight.recipe),
+        Some((split, Some(seed))) => format!("{}, {split} split, seed {seed}", recipe_name(insight.recipe)),
+        Some((split, None)) => format!("{}, {split}", recipe_name(insight.recipe)),
         None => "the map".into(),
     };
     let caption = format!(
@@ -53,8 +54,10 @@ pub fn likelihood(dataset: &Dataset) -> Drawn {
         insight.temperature
     );
     let figure = Figure::new(format!("{}-likelihood", dataset.id), TITLE, caption, json!(data.collect::<Vec<_>>()));
-    let panels = shown.iter().map(|(kind, answer, values)| panel(dataset, insight, kind, answer, values)).collect();
-    figure.with_panels(panels).into()
+    let panels = |width_px: f64| {
+        shown.iter().map(|(kind, answer, values)| panel(dataset, insight, kind, answer, values, width_px)).collect()
+    };
+    figure.responsive(panels).into()
 }
 
 fn relative_nats(values: &[f32], temperature: f64) -> Vec<f32> {
@@ -62,12 +65,20 @@ fn relative_nats(values: &[f32], temperature: f64) -> Vec<f32> {
     values.iter().map(|value| ((f64::from(value - greatest)) / temperature) as f32).collect()
 }
 
-fn panel(dataset: &Dataset, insight: &Insight, kind: &str, answer: &FrameAnswer, values: &[f32]) -> Panel {
+fn panel(
+    dataset: &Dataset,
+    insight: &Insight,
+    kind: &str,
+    answer: &FrameAnswer,
+    values: &[f32],
+    width_px: f64,
+) -> Panel {
     let legend = vec![
         LegendItem::new("truth", Key::Dot(Paint::fill("#ffffff").outlined(INK, 1.6))),
         LegendItem::new("estimate", Key::Diamond(Paint::fill(VERMILION).outlined("#ffffff", 1.0))),
     ];
-    let mut plot = map_plot(format!("{kind}: {}, {} m off", answer.index, meters(answer.error_m())), extent_of(dataset), legend);
+    let title = format!("{kind}: {}, {} m off", answer.index, meters(answer.error_m()));
+    let mut plot = map_plot(title, extent_of(dataset), legend, width_px);
     let range = [-SHOWN_NATS, 0.0];
     plot.surface(&insight.cells, &relative_nats(values, insight.temperature), range, ColorMap::Fading);
     draw_path(&mut plot, &insight.learning_m);

@@ -123,7 +123,8 @@ fn coverage_panel(all: &[Series]) -> Panel {
 }
 
 fn nees_panel(all: &[Series]) -> Panel {
-    let greatest = all.iter().flat_map(|s| s.answers.iter().map(|a| a.nees)).filter(|v| v.is_finite()).fold(10.0, f64::max);
+    let greatest =
+        all.iter().flat_map(|s| s.answers.iter().map(|a| a.nees)).filter(|v| v.is_finite()).fold(10.0, f64::max);
     let x = Axis::new("NEES, eᵀP⁻¹e, logarithmic".replace("ᵀ", "′"), Scale::log(0.05, greatest.min(1e4) * 1.2));
     let percent = [0.0, 0.25, 0.5, 0.75, 1.0].map(|v| (v, format!("{:.0} %", 100.0 * v)));
     let y = Axis::new("share of the frames below", Scale::linear(0.0, 1.0)).with_ticks(percent);
@@ -133,7 +134,8 @@ fn nees_panel(all: &[Series]) -> Panel {
     spec.legend.push(LegendItem::new("χ²(2)", Key::Line(Paint::stroke(INK, 1.2).dashed("4 3"))));
     let mut plot = Plot::new(spec);
     let least = all.iter().map(|series| series.answers.len()).min().unwrap_or(1) as f64;
-    let values: Vec<f64> = (0..=80).map(|i| plot.x.low * (plot.x.high / plot.x.low).powf(f64::from(i) / 80.0)).collect();
+    let values: Vec<f64> =
+        (0..=80).map(|i| plot.x.low * (plot.x.high / plot.x.low).powf(f64::from(i) / 80.0)).collect();
     let below = |v: f64| 1.0 - (-0.5 * v).exp();
     let half = |p: f64| BAND_DEVIATIONS * (p * (1.0 - p) / least).sqrt();
     let lower: Vec<_> = values.iter().map(|&v| [v, (below(v) - half(below(v))).max(0.0)]).collect();
@@ -180,7 +182,11 @@ fn table_panel(all: &[Series]) -> Panel {
             format!("{}–{}", number(low, 1), number(high, 1)),
         ];
         plot.above.line([left, y - 5.0], [left + 12.0, y - 5.0], series.paint);
-        plot.above.text([left + 16.0, y - 1.0], &crate::report::chart::text::fitted(&series.label, 11.0, false, 100.0), NOTE);
+        plot.above.text(
+            [left + 16.0, y - 1.0],
+            &crate::report::chart::text::fitted(&series.label, 11.0, false, 100.0),
+            NOTE,
+        );
         for (at, text) in columns.iter().zip(cells) {
             plot.above.text([*at, y - 1.0], &text, NOTE.anchored(Anchor::End));
         }
@@ -188,7 +194,11 @@ fn table_panel(all: &[Series]) -> Panel {
     let y = top + ROW_PX * (all.len() as f64 + 1.0) + 12.0;
     plot.above.text([left, y], "NEES: mean; expected: where 95 % of such means lie", LABEL);
     let bottom = plot.area_at[1] + plot.area_size[1];
-    plot.above.line([plot.area_at[0], bottom], [plot.area_at[0] + plot.area_size[0], bottom], Paint::stroke("#ffffff", 3.0));
+    plot.above.line(
+        [plot.area_at[0], bottom],
+        [plot.area_at[0] + plot.area_size[0], bottom],
+        Paint::stroke("#ffffff", 3.0),
+    );
     plot.finish()
 }
 

@@ -5,12 +5,12 @@ use serde_json::json;
 use super::paths::extent_of;
 use crate::report::chart::color::{ColorMap, INK};
 use crate::report::chart::map_plot::map_plot;
-use crate::report::chart::plot::Panel;
+use crate::report::chart::plot::{PANEL_WIDTH_PX, Panel};
 use crate::report::chart::svg::Paint;
 use crate::report::dataset::Dataset;
 use crate::report::figure::{Drawn, Figure};
 use crate::report::insight::{GroupSurfaces, Insight, Surface};
-use crate::report::methods::feature_name;
+use crate::report::methods::{feature_name, recipe_name};
 
 pub fn surfaces(dataset: &Dataset) -> Drawn {
     const TITLE: &str = "What the map knows: posterior mean and variance";
@@ -28,7 +28,7 @@ pub fn surfaces(dataset: &Dataset) -> Drawn {
     }
     let (mut panels, mut data) = (Vec::new(), Vec::new());
     for (insight, group) in &shown {
-        let name = format!("{}, {}", insight.recipe, feature_name(group.descriptor.name()));
+        let name = format!("{}, {}", recipe_name(insight.recipe), feature_name(group.descriptor.name()));
         let means = || group.shown.iter().flat_map(|surface| surface.mean.iter());
         let greatest = f64::from(means().fold(0.0_f32, |greatest, value| greatest.max(value.abs())));
         for surface in &group.shown {
@@ -45,7 +45,7 @@ pub fn surfaces(dataset: &Dataset) -> Drawn {
     }
     let caption = "A feature is a number read from each image; the map is what that number should be at every place \
                    (blue below its mean, red above), and how sure that is (variance, noise included). Dots: images learned \
-                   from. Of each recipe’s first type, the features whose surface varies most against their noise.";
+                   from. Of each recipe’s first type, the three features that tell most: whose mean varies most against the variance.";
     let figure = Figure::new(format!("{}-surfaces", dataset.id), TITLE, caption, json!(data));
     figure.with_panels(panels).into()
 }
@@ -73,12 +73,17 @@ fn surface_json(insight: &Insight, group: &GroupSurfaces, surface: &Surface) -> 
 
 fn mean_panel(dataset: &Dataset, insight: &Insight, name: &str, surface: &Surface, greatest: f64) -> Panel {
     let range = [-greatest, greatest];
-    let mut plot = map_plot(format!("{name}: mean of feature {}", surface.feature), extent_of(dataset), Vec::new());
+    let mut plot = map_plot(
+        format!("{name}: mean of feature {}", surface.feature),
+        extent_of(dataset),
+        Vec::new(),
+        PANEL_WIDTH_PX,
+    );
     plot.surface(&insight.cells, &surface.mean, range, ColorMap::Diverging);
     for &position_m in &insight.learning_m {
         plot.dot(position_m, 1.3, Paint::fill(INK).opacity(0.7));
     }
-    plot.color_bar("feature [1]", range, ColorMap::Diverging);
+    plot.color_bar("value of the feature, in its standard deviations", range, ColorMap::Diverging);
     plot.finish()
 }
 
@@ -90,11 +95,11 @@ fn variance_panel(dataset: &Dataset, insight: &Insight, name: &str, surface: &Su
         true => format!("{name}: variance, all features"),
         false => format!("{name}: variance of feature {}", surface.feature),
     };
-    let mut plot = map_plot(title, extent_of(dataset), Vec::new());
+    let mut plot = map_plot(title, extent_of(dataset), Vec::new(), PANEL_WIDTH_PX);
     plot.surface(&insight.cells, &surface.variance, range, ColorMap::Sequential);
     for &position_m in &insight.learning_m {
         plot.dot(position_m, 1.3, Paint::fill("#ffffff").outlined(INK, 0.5));
     }
-    plot.color_bar("variance [1]", range, ColorMap::Sequential);
+    plot.color_bar("variance of the feature, noise included", range, ColorMap::Sequential);
     plot.finish()
 }

@@ -22,7 +22,10 @@ pub fn timeline(dataset: &Dataset) -> Drawn {
         return Drawn::left_out(TITLE, why);
     }
     let Some(filtered) = dataset.sequences.iter().find(|sequence| sequence.estimator == "filtered") else {
-        return Drawn::left_out(TITLE, "It is not known when the frames were taken, so there is no order to filter them in.");
+        return Drawn::left_out(
+            TITLE,
+            "It is not known when the frames were taken, so there is no order to filter them in.",
+        );
     };
     if dataset.frames.iter().any(|frame| frame.time_s.is_none()) {
         return Drawn::left_out(TITLE, "It is not known when the frames were taken.");
@@ -90,9 +93,12 @@ fn panel(dataset: &Dataset, filtered: &ShownSequence, width_px: f64) -> Panel {
         LegendItem::new("95 % region of the filter", Key::Box(Paint::fill(BLUE).opacity(0.2))),
         LegendItem::new("smoothed", Key::Line(Paint::stroke(PURPLE, 1.4))),
     ];
-    spec.legend.extend(states.iter().filter(has_state).map(|state| {
-        LegendItem::new(state.name(), Key::Box(Paint::fill(state_color(*state))))
-    }));
+    spec.legend.extend(
+        states
+            .iter()
+            .filter(has_state)
+            .map(|state| LegendItem::new(state.name(), Key::Box(Paint::fill(state_color(*state))))),
+    );
     let mut plot = Plot::new(spec);
     // Runs of frames that follow one another.
     let runs = |answers: &'_ [FrameAnswer]| -> Vec<Vec<FrameAnswer>> {
@@ -130,7 +136,8 @@ fn panel(dataset: &Dataset, filtered: &ShownSequence, width_px: f64) -> Panel {
     }
     plot.inside.append(&band);
     let localized = filtered.states.iter().filter(|state| **state == Some(LocalizationState::Localized)).count();
-    let text = format!("{:.0} % of the frames localized", 100.0 * localized as f64 / filtered.states.len().max(1) as f64);
+    let text =
+        format!("{:.0} % of the frames localized", 100.0 * localized as f64 / filtered.states.len().max(1) as f64);
     let at = [plot.area_at[0] + 6.0, top + BAND_PX + 14.0];
     plot.above.haloed_text(at, &text, LABEL);
     plot.finish()
