@@ -15,10 +15,15 @@ pub struct ErrorFigures {
     pub max_m: f64,
     /// Share of the errors over 10 m.
     pub share_over_10m: f64,
+    /// Share of the errors up to each of [`RECALL_M`].
+    pub recall: [f64; 4],
     /// 1 − RMSE / RMSE of always giving the same answer, the component-wise median of the learning positions: 1 is
     /// perfect, 0 knows nothing, below 0 misleads.
     pub skill: f64,
 }
+
+/// Distances that recalls are counted within \[m\].
+pub const RECALL_M: [f64; 4] = [1.0, 2.0, 5.0, 10.0];
 
 impl ErrorFigures {
     /// `know_nothing_m` is the answer that the skill is measured against. `None` for no estimates.
@@ -38,6 +43,8 @@ impl ErrorFigures {
             p95_m: quantile(&errors_m, 0.95),
             max_m: errors_m[errors_m.len() - 1],
             share_over_10m: errors_m.iter().filter(|&&e| e > 10.0).count() as f64 / errors_m.len() as f64,
+            recall: RECALL_M
+                .map(|within_m| errors_m.partition_point(|&e| e <= within_m) as f64 / errors_m.len() as f64),
             skill: 1.0 - rmse_m / root_mean_square(&of_median),
         })
     }
@@ -57,12 +64,12 @@ pub fn component_median(positions: &[PositionM]) -> PositionM {
     })
 }
 
-fn root_mean_square(values: &[f64]) -> f64 {
+pub(crate) fn root_mean_square(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
 }
 
 /// Quantile of sorted values, interpolated linearly between order statistics (Hyndman & Fan 1996, type 7).
-fn quantile(sorted: &[f64], q: f64) -> f64 {
+pub(crate) fn quantile(sorted: &[f64], q: f64) -> f64 {
     let at = q * (sorted.len() - 1) as f64;
     let (below, fraction) = (at.floor() as usize, at.fract());
     let above = (below + 1).min(sorted.len() - 1);
@@ -81,7 +88,7 @@ mod tests {
         // Errors 0, 5, 1, 12.
         assert_eq!((figures.n, figures.max_m, figures.share_over_10m), (4, 12.0, 0.25));
         assert!((figures.rmse_m - (170.0_f64 / 4.0).sqrt()).abs() < 1e-12);
-        assert_eq!(figures.median_m, 3.0);
+        assert_eq!((figures.median_m, figures.recall), (3.0, [0.5, 0.5, 0.75, 0.75]));
         assert!((figures.p90_m - (5.0 + 0.7 * 7.0)).abs() < 1e-12);
         // From (5, 5): distances² 50, 50, 50, 450.
         assert!((figures.skill - (1.0 - (170.0_f64 / 600.0).sqrt())).abs() < 1e-12);

@@ -74,6 +74,31 @@ fn a_map_is_trained_shown_checked_and_measured_against() {
         (24, &serde_json::Value::Null)
     );
     assert_eq!(results["program"], env!("CARGO_PKG_VERSION"));
+    // Without its images only the map's own features can be compared.
+    let methods = |results: &serde_json::Value| -> Vec<String> {
+        let rows = results["results"].as_array().expect("a list");
+        let baselines = rows.iter().filter(|row| row["recipe"].is_null());
+        baselines.map(|row| row["features"].as_str().expect("a name").to_owned()).collect()
+    };
+    assert!(stderr.contains("no rows for aligned, bow: a map holds features, not images"), "{stderr}");
+    assert_eq!(methods(&results), ["nearest", "median"]);
+    let with_images = folder.path().join("with-images.json");
+    let (code, _, stderr) = run(omniloc()
+        .arg("evaluate")
+        .arg(&recording)
+        .arg("--map")
+        .arg(&map)
+        .arg("--survey")
+        .arg(&recording)
+        .args(["--frames", "--json"])
+        .arg(&with_images));
+    assert_eq!(code, 0, "{stderr}");
+    let with_images: serde_json::Value =
+        serde_json::from_slice(&fs::read(with_images).expect("written")).expect("JSON");
+    assert_eq!(methods(&with_images), ["nearest", "aligned", "bow", "bow-nearest", "median"]);
+    let assignment = &with_images["assignments"][0];
+    assert_eq!(assignment["test"].as_array().expect("a list").len(), 24);
+    assert!(assignment["learning"][0]["label"].is_number() && assignment["classified_share"].is_number());
 
     // The same call, the same bytes.
     let again = folder.path().join("again.map");
@@ -102,7 +127,20 @@ fn the_protocol_runs_with_both_recipes_and_a_split_from_a_file() {
     let results: serde_json::Value = serde_json::from_slice(&fs::read(results).expect("written")).expect("JSON");
     let rows = results["results"].as_array().expect("a list");
     let recipes: Vec<_> = rows.iter().map(|row| row["recipe"].as_str()).collect();
-    assert_eq!(recipes, [Some("paper"), Some("default"), None]);
+    assert_eq!(recipes[..2], [Some("paper"), Some("default")]);
+    let baselines: Vec<_> = rows[2..].iter().map(|row| row["features"].as_str().expect("a name")).collect();
+    assert_eq!(baselines, ["nearest", "aligned", "bow", "bow-nearest", "median"]);
+    for row in rows {
+        let recall = ["recall_1m", "recall_2m", "recall_5m", "recall_10m"].map(|key| row[key].as_f64().expect(key));
+        assert!(recall.is_sorted() && row["frames"].is_null(), "{row}");
+    }
+    assert_eq!((&rows[0]["chosen_on"], &rows[1]["chosen_on"]), (&"validation".into(), &serde_json::Value::Null));
+    // The default recipe is what the others are compared with, but for labels.
+    let comparisons = results["statistics"]["comparisons"].as_array().expect("a list");
+    let compared: Vec<_> = comparisons.iter().map(|c| c["method"]["features"].as_str().expect("a name")).collect();
+    assert_eq!(compared, ["sp", "nearest", "aligned", "bow-nearest", "median"]);
+    assert!(comparisons.iter().all(|c| c["reference"]["recipe"] == "default" && c["p_holm"].is_number()));
+    assert_eq!(results["statistics"]["methods"].as_array().expect("a list").len(), 7);
     let paper = &rows[0];
     assert!(paper["kept"].as_u64() <= paper["rank"].as_u64() && paper["bic_all"].is_number(), "{paper}");
     assert!(paper["seed"].is_null() && paper["n_learned_from"] == 12, "{paper}");

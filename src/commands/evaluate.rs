@@ -9,21 +9,18 @@ use serde_json::json;
 use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
 use super::reporter::Reporter;
-#[cfg(not(feature = "report"))]
-use super::reporter::TrialFacts;
 use super::survey::{
-    bad_argument, default_grid_step_m, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
-    read_to_match, read_truth,
+    bad_argument, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_to_match, read_truth,
 };
 use super::{BadArgument, DONE, print};
-use crate::evaluate::{Entry, LEGEND, SequenceFigures, against_map, table};
+use crate::evaluate::baselines::{Baseline, BaselineRows, Views};
+use crate::evaluate::{
+    Case, Entry, Evaluation, LEGEND, MapComparison, Protocol, Statistics, Variant, map_entries, statistics, table,
+};
 use crate::features::Descriptor;
 use crate::map::{FeatureMap, Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
-use crate::metrics::{ErrorFigures, component_median};
 use crate::recording::{Recording, write_bytes_atomically};
-#[cfg(feature = "report")]
-use crate::report::TrialFacts;
-use crate::train::{Outcome, Similarity, Split, Survey, TrackSmoother, Trial, noisy, run as run_trial};
+use crate::train::{Outcomes, Similarity, Split, Survey, TrackSmoother, Trial};
 use crate::types::PositionM;
 
 /// Measure how well the method localizes on recordings
@@ -82,6 +79,21 @@ pub struct Args {
     /// recipe, none for the paper's]
     #[arg(long, value_enum)]
     pub smooth: Option<Smoothing>,
+    /// What to compare with, separated by commas: none; nearest, the nearest learning image by z-scored properties;
+    /// aligned, the nearest by circular correlation of small panoramas; bow, a bag of words of upright patches, by the
+    /// paper's protocol and as nearest image [default: nearest,aligned,bow]
+    #[arg(
+        long,
+        value_enum,
+        value_delimiter = ',',
+        default_values = ["nearest", "aligned", "bow"],
+        hide_default_value = true,
+        hide_possible_values = true
+    )]
+    pub baselines: Vec<Baseline>,
+    /// With --map: the recordings it was trained on, for the baselines that compare images; a map holds none
+    #[arg(long, value_name = "REC.mcap", requires = "map")]
+    pub survey: Vec<PathBuf>,
     /// Distance of neighbouring candidate cells [m; default: 1 outdoors, 0.1 where the positions lie within 20 m]
     #[arg(long, value_name = "M", allow_negative_numbers = true)]
     pub grid_step_m: Option<f64>,
@@ -98,46 +110,33 @@ pub struct Args {
     /// drawn as JSON
     #[arg(long, value_name = "DIR")]
     pub report: Option<PathBuf>,
-    /// With --map and --report: recordings that the map was learned from, to show their images beside the worst frames
-    #[arg(long, value_name = "REC.mcap", requires_all = ["map", "report"], num_args = 1)]
-    pub survey: Vec<PathBuf>,
     /// Replace the JSON file or the report if it exists
     #[arg(long)]
     pub force: bool,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Variant {
-    Plain,
-    Noisy,
-    Fixed,
-}
-
-/// What a trial is run on.
-struct Case {
-    split_name: String,
-    split: Split,
-    /// `None` for a split from a file.
-    seed: Option<u64>,
-    variant: Variant,
-}
-
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let entries = evaluate(args)?;
+    let evaluation = evaluate(args)?;
     if let Some(path) = &args.json {
-        write_json(path, args, entries)?;
+        write_json(path, args, evaluation)?;
     }
     Ok(DONE.into())
 }
 
 /// Evaluates and prints.
-pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
+pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
+    for baseline in &args.baselines {
+        let refused = |reason: &str| BadArgument(format!("--baselines {}: {reason}", baseline.name()));
+        if *baseline == Baseline::None && args.baselines.len() > 1 {
+            return Err(refused("goes with no other").into());
+        }
+    }
     if args.truth.is_some() && args.recordings.len() > 1 {
         return Err(BadArgument("--truth goes with one recording".into()).into());
     }
     if let Some(json) = &args.json {
         check_output(json, OutputKind::File, args.force)?;
-        let inputs = args.recordings.iter().chain(&args.map).chain(&args.truth);
+        let inputs = args.recordings.iter().chain(&args.map).chain(&args.truth).chain(&args.survey);
         check_not_input(json, inputs)?;
         let folder = json.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if !folder.is_dir() {
@@ -151,25 +150,29 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
     let recordings = open_recordings(&args.recordings, spacing_m)?;
     let mut reporter =
         args.report.as_ref().map(|folder| Reporter::new(folder, args.force, settings(args))).transpose()?;
-    let surveys = if args.survey.is_empty() { Vec::new() } else { open_recordings(&args.survey, Some(0.0))? };
     let progress = Progress::new();
-    let mut all = Vec::new();
+    let mut all = Evaluation::default();
     for (number, recording) in recordings.iter().enumerate() {
-        let entries = match &args.map {
+        let evaluation = match &args.map {
             Some(path) => on_map(args, path, recording, reporter.as_mut(), &progress)?,
             None => protocol(args, recording, reporter.as_mut(), &progress)?,
         };
         if let Some(reporter) = &mut reporter {
-            reporter.take_entries(&entries);
+            reporter.take_evaluation(&evaluation);
         }
+        let Evaluation { entries, statistics, assignments } = evaluation;
         progress.finish();
         print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
         print(&in_words(&entries))?;
-        all.extend(entries);
+        print(&statistics::text(&statistics))?;
+        all.entries.extend(entries);
+        all.statistics.methods.extend(statistics.methods);
+        all.statistics.comparisons.extend(statistics.comparisons);
+        all.assignments.extend(assignments);
     }
-    print(&format!("\n{LEGEND}"))?;
+    print(&format!("\n{LEGEND}\n{}", statistics::LEGEND))?;
     if let Some(reporter) = reporter {
-        let page = reporter.write(&recordings, &surveys, &progress)?;
+        let page = reporter.write(&recordings, &progress)?;
         progress.finish();
         print(&format!("\nreport     {}\n", page.display()))?;
     }
@@ -179,33 +182,29 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Vec<Entry>> {
 /// Options and what they were, for the report.
 fn settings(args: &Args) -> Vec<(String, String)> {
     let list = |values: &mut dyn Iterator<Item = String>| values.collect::<Vec<_>>().join(", ");
-    let own = |what: &str| format!("as the recipe has it{what}");
+    let own = || "as the recipe has it".to_owned();
+    let name = |value: &dyn std::fmt::Debug| format!("{value:?}").to_lowercase();
     let mut settings = vec![("recordings", list(&mut args.recordings.iter().map(|path| path.display().to_string())))];
     match &args.map {
         Some(map) => settings.push(("map", map.display().to_string())),
-        None => settings.extend([
-            ("recipes", list(&mut args.recipe.iter().map(|recipe| recipe.name().into()))),
-            (
-                "feature types",
-                match args.features.is_empty() {
-                    true => own(""),
-                    false => list(&mut args.features.iter().map(|descriptor| descriptor.name().into())),
-                },
-            ),
-            ("selection", args.select.map_or_else(|| own(""), |select| format!("{select:?}").to_lowercase())),
-            ("splits", list(&mut args.split.iter().cloned())),
-            ("seeds", list(&mut (args.seed..args.seed + args.seeds).map(|seed| seed.to_string()))),
-            ("variants of the random split", list(&mut args.variants.iter().map(|v| format!("{v:?}").to_lowercase()))),
-            (
-                "smoothing of the track",
-                args.smooth.map_or_else(|| own(""), |smooth| format!("{smooth:?}").to_lowercase()),
-            ),
-            (
-                "grid step",
-                args.grid_step_m.map_or("1 m outdoors, 0.1 m within 20 m".into(), |step_m| format!("{step_m} m")),
-            ),
-        ]),
+        None => {
+            let features = list(&mut args.features.iter().map(|descriptor| descriptor.name().into()));
+            settings.extend([
+                ("recipes", list(&mut args.recipe.iter().map(|recipe| recipe.name().into()))),
+                ("feature types", if features.is_empty() { own() } else { features }),
+                ("selection", args.select.map_or_else(own, |select| name(&select))),
+                ("splits", list(&mut args.split.iter().cloned())),
+                ("seeds", list(&mut (args.seed..args.seed + args.seeds).map(|seed| seed.to_string()))),
+                ("variants of the random split", list(&mut args.variants.iter().map(|variant| name(variant)))),
+                ("smoothing of the track", args.smooth.map_or_else(own, |smooth| name(&smooth))),
+                (
+                    "grid step",
+                    args.grid_step_m.map_or("1 m outdoors, 0.1 m within 20 m".into(), |step_m| format!("{step_m} m")),
+                ),
+            ]);
+        }
     }
+    settings.push(("baselines", list(&mut args.baselines.iter().map(|baseline| baseline.name().into()))));
     let spacing = match (args.spacing_m, &args.map) {
         (Some(spacing_m), _) => format!("{spacing_m} m"),
         (None, Some(_)) => "none: every frame".into(),
@@ -253,13 +252,52 @@ fn on_map(
     recording: &Recording,
     reporter: Option<&mut Reporter>,
     progress: &Progress,
-) -> anyhow::Result<Vec<Entry>> {
+) -> anyhow::Result<Evaluation> {
     let map = open_map(path)?;
     if map.info.recordings.iter().any(|trained_on| trained_on.name == recording.name) {
         eprintln!("warning: the map was trained on {}: it knows these frames, and the errors flatter", recording.name);
     }
     let descriptors = map.info.groups.iter().map(|group| group.recipe.descriptor).collect();
-    let mut recording = recording.clone();
+    let recording = moved_to(&map, path, recording.clone())?;
+    let survey = read_to_match(&recording, descriptors, progress)?;
+    map.info
+        .check_lens(&survey.calibration, survey.image_size_px)
+        .with_context(|| format!("{} against {}", recording.path.display(), path.display()))?;
+    let truth_m = truth(args, &survey)?;
+    let mut entries = map_entries(&recording.name, &survey, &map, &truth_m);
+    let learned = if args.survey.is_empty() { Vec::new() } else { open_surveys(args, path, &map)? };
+    if let Some(reporter) = reporter {
+        progress.begin("report: what the map knows", 1);
+        reporter.begin(&recording, &survey, &truth_m)?;
+        reporter.take_map(&survey, path, &map, &learned)?;
+    }
+
+    let mut rows = BaselineRows::default();
+    let comparison = MapComparison { dataset: &recording.name, survey: &survey, map: &map, truth_m: &truth_m };
+    if args.baselines.contains(&Baseline::Nearest) {
+        comparison.add_nearest(&mut rows);
+    }
+    let compare_images: Vec<&str> =
+        args.baselines.iter().filter(|baseline| baseline.compares_images()).map(|baseline| baseline.name()).collect();
+    if !compare_images.is_empty() && args.survey.is_empty() {
+        let names = compare_images.join(", ");
+        eprintln!(
+            "note: no rows for {names}: a map holds features, not images; --survey names the recordings it is of"
+        );
+    } else if !compare_images.is_empty() {
+        let views = read_views(&learned.iter().chain([&recording]).collect::<Vec<_>>(), args, false, progress)?;
+        progress.begin("baselines", 1);
+        comparison.add_views(&mut rows, &learned, &views);
+    }
+    comparison.add_median(&mut rows);
+    rows.notes.iter().for_each(|note| progress.say(&format!("note: {note}")));
+    entries.extend(rows.entries);
+    let statistics = Statistics::of(&entries);
+    Ok(Evaluation { entries, statistics, assignments: rows.assignments })
+}
+
+/// `recording` with its positions counted from the map's origin.
+fn moved_to(map: &FeatureMap, path: &Path, mut recording: Recording) -> anyhow::Result<Recording> {
     if let Some(origin) = map.info.origin
         && !recording.move_origin(origin)
     {
@@ -270,62 +308,36 @@ fn on_map(
             path.display()
         );
     }
-    let survey = read_to_match(&recording, descriptors, progress)?;
-    map.info
-        .check_lens(&survey.calibration, survey.image_size_px)
-        .with_context(|| format!("{} against {}", recording.path.display(), path.display()))?;
-    let truth_m = truth(args, &survey)?;
-    let indices: Vec<usize> = survey.frames.iter().map(|frame| frame.index).collect();
-    let base = Entry {
-        dataset: recording.name.clone(),
-        estimator: "single",
-        n_learning: map.positions_m.len(),
-        n_learned_from: map.positions_m.len(),
-        n_test: survey.len(),
-        ..Entry::default()
-    };
-    let know_nothing_m = component_median(&map.positions_m);
-    let outcomes = against_map(&survey, &map, &truth_m);
-    if let Some(reporter) = reporter {
-        reporter.begin(&recording, &survey, &truth_m)?;
-        reporter.take_map(&survey, path, &map, &outcomes.sequences)?;
+    Ok(recording)
+}
+
+/// The recordings that a map was made of.
+fn open_surveys(args: &Args, path: &Path, map: &FeatureMap) -> anyhow::Result<Vec<Recording>> {
+    let recordings = open_recordings(&args.survey, None)?;
+    let frames: usize = recordings.iter().map(|recording| recording.survey.len()).sum();
+    if frames != map.positions_m.len() {
+        eprintln!(
+            "warning: {} was learned from {} frames, --survey has {frames}: the baselines do not learn from the same",
+            path.display(),
+            map.positions_m.len()
+        );
     }
-    let mut entries: Vec<Entry> = outcomes
-        .single
-        .into_iter()
-        .map(|outcome| {
-            let entry = Entry {
-                recipe: Some(map.info.recipe.name()),
-                features: outcome.features,
-                m: Some(outcome.m),
-                rank: Some(outcome.rank),
-                kept: Some(outcome.kept),
-                compression: compression(outcome.m, outcome.kept),
-                coverage_95: outcome.coverage_95,
-                ..base.clone()
-            };
-            let entry = entry.with_figures(ErrorFigures::of(&outcome.estimates_m, &truth_m, know_nothing_m));
-            entry.with_frames(&indices, &truth_m, &outcome.estimates_m)
-        })
-        .collect();
-    let stamps_ns: Vec<u64> = survey.frames.iter().map(|frame| frame.stamp_ns).collect();
-    let yaws_rad: Vec<Option<f64>> = survey.frames.iter().map(|frame| frame.yaw_rad).collect();
-    for sequence in &outcomes.sequences {
-        let said = sequence.poses.iter().zip(&truth_m).filter_map(|(pose, truth_m)| Some((pose.as_ref()?, *truth_m)));
-        let (estimates_m, said_truth_m): (Vec<_>, Vec<_>) = said.map(|(pose, truth)| (pose.position_m, truth)).unzip();
-        let figures = SequenceFigures::of(sequence, &stamps_ns, &truth_m, &yaws_rad);
-        let entry = Entry {
-            recipe: Some(map.info.recipe.name()),
-            features: sequence.estimator.into(),
-            estimator: sequence.estimator,
-            ..base.clone()
-        };
-        let entry = entry.with_figures(ErrorFigures::of(&estimates_m, &said_truth_m, know_nothing_m));
-        let entry = figures.map_or(entry.clone(), |figures| entry.with_sequence(&figures));
-        entries.push(entry.with_poses(&indices, &truth_m, sequence));
+    let moved = recordings.into_iter().map(|recording| {
+        map.info
+            .check_lens(&recording.calibration()?, map.info.image_size_px.into())
+            .with_context(|| format!("--survey {}", recording.path.display()))?;
+        moved_to(map, path, recording)
+    });
+    moved.collect()
+}
+
+/// Reads what the baselines that compare images need of all frames of `recordings`.
+fn read_views(recordings: &[&Recording], args: &Args, fixed: bool, progress: &Progress) -> anyhow::Result<Views> {
+    let frames = recordings.iter().map(|recording| recording.survey.len()).sum();
+    if args.baselines.iter().any(|baseline| baseline.compares_images()) {
+        progress.begin(if fixed { "reading views, turned by their yaw" } else { "reading views" }, frames);
     }
-    entries.push(median_entry(base, &map.positions_m, &truth_m));
-    Ok(entries)
+    Ok(Views::read(recordings, &args.baselines, fixed, |frames| progress.advance(frames))?)
 }
 
 pub fn open_map(path: &Path) -> anyhow::Result<FeatureMap> {
@@ -340,7 +352,7 @@ fn protocol(
     recording: &Recording,
     mut reporter: Option<&mut Reporter>,
     progress: &Progress,
-) -> anyhow::Result<Vec<Entry>> {
+) -> anyhow::Result<Evaluation> {
     let recipes: Vec<Recipe> = args
         .recipe
         .iter()
@@ -348,45 +360,66 @@ fn protocol(
         .map(|recipe| args.select.map_or(recipe.clone(), |selection| recipe.with_selection(selection)))
         .collect();
     let recording_of = std::slice::from_ref(recording);
-    let plain = read_to_learn(recording_of, &recipes, false, progress)?;
-    let wants_fixed = args.variants.contains(&Variant::Fixed) && args.split.iter().any(|split| split == "random");
-    let fixed = match wants_fixed && plain.frames.iter().all(|frame| frame.yaw_rad.is_some()) {
-        true => Some(read_to_learn(recording_of, &recipes, true, progress)?),
-        false => None,
+    let read_all = |fixed: bool| -> anyhow::Result<(Survey, Views)> {
+        let survey = read_to_learn(recording_of, &recipes, fixed, progress)?;
+        Ok((survey, read_views(&[recording], args, fixed, progress)?))
     };
+    let (plain, plain_views) = read_all(false)?;
+    let wants_fixed = args.variants.contains(&Variant::Fixed) && args.split.iter().any(|split| split == "random");
+    let has_yaws = plain.frames.iter().all(|frame| frame.yaw_rad.is_some());
+    let fixed = if wants_fixed && has_yaws { Some(read_all(true)?) } else { None };
     if wants_fixed && fixed.is_none() {
         eprintln!("note: {}: not every frame has a yaw; there are no (fixed) rows", recording.name);
     }
-    let truth_m = truth(args, &plain)?;
-    if let Some(reporter) = &mut reporter {
-        reporter.begin(recording, &plain, &truth_m)?;
-    }
-    let similarity = |recipe: &Recipe| match smoothing(args, recipe) {
-        Smoothing::None => None,
-        Smoothing::Track => Similarity::of(&plain, recipe),
-    };
+    let exact_m = args.truth.as_ref().map(|path| read_truth(path, &plain)).transpose()?;
+    let smooths = |recipe: &Recipe| args.smooth.unwrap_or(Smoothing::usual(recipe.name)) == Smoothing::Track;
+    let similarity = |recipe: &Recipe| smooths(recipe).then(|| Similarity::of(&plain, recipe)).flatten();
     let similarities: Vec<Option<Similarity>> = recipes.iter().map(similarity).collect();
-    let smoother = TrackSmoother::new(&plain, &plain.positions_m());
-    let mut entries = Vec::new();
-    for case in cases(args, &plain)? {
-        let survey = match (case.variant, &fixed) {
-            (Variant::Fixed, Some(fixed)) => fixed,
-            (Variant::Fixed, None) => continue,
-            _ => &plain,
-        };
-        let learning = Learning { recipes: &recipes, similarities: &similarities, smoother: &smoother };
-        entries.extend(trial_entries(
-            args,
-            recording,
-            survey,
-            &learning,
-            &truth_m,
-            &case,
-            reporter.as_deref_mut(),
-            progress,
-        )?);
+    let protocol = Protocol {
+        dataset: &recording.name,
+        recipes: &recipes,
+        similarities: &similarities,
+        smoother: &TrackSmoother::new(&plain, &plain.positions_m()),
+        smoothing: args.smooth,
+        truth_m: exact_m.as_deref(),
+        grid_step_m: args.grid_step_m,
+        baselines: &args.baselines,
+    };
+    if let Some(reporter) = &mut reporter {
+        reporter.begin(recording, &plain, exact_m.as_ref().unwrap_or(&plain.positions_m()))?;
     }
-    Ok(entries)
+    let mut all = Evaluation::default();
+    for case in cases(args, &plain)? {
+        let (survey, views) = match (case.variant, &fixed) {
+            (Variant::Fixed, Some((survey, views))) => (survey, views),
+            (Variant::Fixed, None) => continue,
+            _ => (&plain, &plain_views),
+        };
+        let mut seen = Ok(());
+        let on_trial = |trial: &Trial, outcomes: &Outcomes| {
+            if let (Some(reporter), Variant::Plain, Ok(())) = (&mut reporter, case.variant, &seen) {
+                seen = reporter.take_trial(survey, &case, trial, outcomes);
+            }
+        };
+        let on_step = |part: &str, step| progress.step(part, step);
+        let results = protocol.run(survey, &case, on_step, on_trial).map_err(bad_argument)?;
+        seen?;
+        // What the fits have to say is said once, not for every seed and variant.
+        let is_first = case.variant == Variant::Plain
+            && case.split_name == args.split[0]
+            && case.seed.is_none_or(|seed| seed == args.seed);
+        progress.begin(&format!("baselines, {}", case.describe()), 1);
+        let rows = protocol.run_baselines(survey, views, &case);
+        for note in results.notes.iter().chain(&rows.notes).filter(|_| is_first) {
+            progress.say(&format!("note: {note}"));
+        }
+        all.entries.extend(results.entries);
+        all.entries.extend(rows.entries);
+        all.assignments.extend(rows.assignments);
+    }
+    progress.begin("statistics", 1);
+    all.statistics = Statistics::of(&all.entries);
+    Ok(all)
 }
 
 /// Splits, seeds and variants, in the order of the table.
@@ -417,151 +450,6 @@ fn cases(args: &Args, survey: &Survey) -> anyhow::Result<Vec<Case>> {
     Ok(cases)
 }
 
-/// What all cases learn with.
-struct Learning<'a> {
-    recipes: &'a [Recipe],
-    /// One a recipe; `None` where no track is smoothed, or nothing is known of how images change.
-    similarities: &'a [Option<Similarity>],
-    /// Of the positions as they were recorded.
-    smoother: &'a TrackSmoother,
-}
-
-/// All rows of one case: the recipes, and the answer that knows nothing.
-fn trial_entries(
-    args: &Args,
-    recording: &Recording,
-    survey: &Survey,
-    learning: &Learning,
-    truth_m: &[PositionM],
-    case: &Case,
-    mut reporter: Option<&mut Reporter>,
-    progress: &Progress,
-) -> anyhow::Result<Vec<Entry>> {
-    let recorded_m = match case.variant {
-        Variant::Noisy => noisy(&survey.positions_m(), case.seed.unwrap_or(0)),
-        _ => survey.positions_m(),
-    };
-    // Noise on all positions is also on those that errors are measured against, unless the truth is given.
-    let truth_m = if args.truth.is_some() { truth_m } else { &recorded_m };
-    let pick = |rows: &[usize], of: &[PositionM]| -> Vec<PositionM> { rows.iter().map(|&row| of[row]).collect() };
-    let (test_m, validation_m) = (pick(&case.split.test, truth_m), pick(&case.split.validation, &recorded_m));
-    let indices: Vec<usize> = case.split.test.iter().map(|&row| survey.frames[row].index).collect();
-    let grid_step_m = args.grid_step_m.unwrap_or_else(|| default_grid_step_m(&recorded_m));
-    let base = Entry {
-        dataset: recording.name.clone(),
-        estimator: "single",
-        split: Some(case.split_name.clone()),
-        seed: case.seed,
-        noisy: case.variant == Variant::Noisy,
-        fixed: case.variant == Variant::Fixed,
-        n_learning: case.split.learning.len(),
-        n_validation: case.split.validation.len(),
-        n_test: case.split.test.len(),
-        n_learned_from: case.split.learning.len(),
-        ..Entry::default()
-    };
-    // What the fits have to say is said once, not for every seed and variant.
-    let announced = case.variant == Variant::Plain
-        && case.split_name == args.split[0]
-        && case.seed.is_none_or(|seed| seed == args.seed);
-    let know_nothing_m = component_median(&pick(&case.split.learning, &recorded_m));
-    let noisy_smoother = (case.variant == Variant::Noisy).then(|| TrackSmoother::new(survey, &recorded_m));
-    let smoother = noisy_smoother.as_ref().unwrap_or(learning.smoother);
-    let mut entries = Vec::new();
-    for (recipe, similarity) in learning.recipes.iter().zip(learning.similarities) {
-        let variant = match case.variant {
-            Variant::Plain => "",
-            Variant::Noisy => " (noisy)",
-            Variant::Fixed => " (fixed)",
-        };
-        let seed = case.seed.map(|seed| format!(", seed {seed}")).unwrap_or_default();
-        let part = format!("{}, {}{variant}{seed}", recipe.name.name(), case.split_name);
-        let learned_m = match smoothing(args, recipe) {
-            Smoothing::None => recorded_m.clone(),
-            Smoothing::Track => {
-                // The images of frames that are never learned from have no part in it.
-                let mut learned = case.split.learning.clone();
-                if recipe.refit {
-                    learned.extend(&case.split.validation);
-                    learned.sort_unstable();
-                }
-                smoother.smoothed(&learned, similarity.as_ref()).positions_m
-            }
-        };
-        let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &learned_m };
-        let outcomes = run_trial(survey, &trial, |step| progress.step(&part, step)).map_err(bad_argument)?;
-        if let (Some(reporter), Variant::Plain) = (&mut reporter, case.variant) {
-            let (split_name, seed, learned_m) = (&case.split_name[..], case.seed, &learned_m[..]);
-            let facts = TrialFacts { recipe, split: &case.split, split_name, seed, grid_step_m, learned_m, truth_m };
-            reporter.take_trial(survey, &facts, &outcomes)?;
-        }
-        for outcome in &outcomes.rows {
-            for (warning, count) in outcome.warnings.iter().filter(|_| announced) {
-                let (features, of) = (&outcome.features, outcome.rank);
-                progress.say(&format!("note: {part}: {features}: {count} of {of} fits: {}", warning.describe()));
-            }
-            let base = Entry { n_learned_from: outcomes.learned_from, ..base.clone() };
-            let entry = outcome_entry(base, recipe, outcome, &validation_m, &test_m, know_nothing_m);
-            let estimates_m = estimates_of(recipe, outcome);
-            entries.push(entry.with_frames(&indices, &test_m, estimates_m));
-        }
-    }
-    entries.push(median_entry(base, &pick(&case.split.learning, &recorded_m), &test_m));
-    Ok(entries)
-}
-
-/// The estimates that a recipe stands for: with the features it keeps.
-fn estimates_of<'a>(recipe: &Recipe, outcome: &'a Outcome) -> &'a [PositionM] {
-    match recipe.selection {
-        Selection::None => &outcome.all_test_m,
-        Selection::Backward | Selection::Folded => &outcome.kept_test_m,
-    }
-}
-
-fn outcome_entry(
-    base: Entry,
-    recipe: &Recipe,
-    outcome: &Outcome,
-    validation_m: &[PositionM],
-    test_m: &[PositionM],
-    know_nothing_m: PositionM,
-) -> Entry {
-    let rmse_m = |estimates_m: &[PositionM], truth_m: &[PositionM]| {
-        ErrorFigures::of(estimates_m, truth_m, know_nothing_m).map(|f| f.rmse_m)
-    };
-    let selects = recipe.selection != Selection::None;
-    let entry = Entry {
-        recipe: Some(recipe.name.name()),
-        features: outcome.features.clone(),
-        m: Some(outcome.m),
-        rank: Some(outcome.rank),
-        kept: Some(outcome.kept),
-        compression: compression(outcome.m, outcome.kept),
-        rmse_all_test_m: rmse_m(&outcome.all_test_m, test_m),
-        rmse_be_validation_m: rmse_m(&outcome.kept_validation_m, validation_m),
-        rmse_be_test_m: selects.then(|| rmse_m(&outcome.kept_test_m, test_m)).flatten(),
-        bic_all: outcome.bic_all,
-        bic_kept: outcome.bic_kept.filter(|_| selects),
-        ..base
-    };
-    entry.with_figures(ErrorFigures::of(estimates_of(recipe, outcome), test_m, know_nothing_m))
-}
-
-/// The row of always answering the median of the learning positions.
-fn median_entry(base: Entry, learning_m: &[PositionM], truth_m: &[PositionM]) -> Entry {
-    let median_m = component_median(learning_m);
-    let answers = vec![median_m; truth_m.len()];
-    Entry { features: "median".into(), ..base }.with_figures(ErrorFigures::of(&answers, truth_m, median_m))
-}
-
-fn compression(m: usize, kept: usize) -> Option<f64> {
-    (kept > 0).then(|| m as f64 / kept as f64)
-}
-
-fn smoothing(args: &Args, recipe: &Recipe) -> Smoothing {
-    args.smooth.unwrap_or(Smoothing::usual(recipe.name))
-}
-
 fn truth(args: &Args, survey: &Survey) -> anyhow::Result<Vec<PositionM>> {
     match &args.truth {
         Some(path) => read_truth(path, survey),
@@ -569,18 +457,22 @@ fn truth(args: &Args, survey: &Survey) -> anyhow::Result<Vec<PositionM>> {
     }
 }
 
-fn write_json(path: &Path, args: &Args, mut entries: Vec<Entry>) -> anyhow::Result<()> {
-    if !args.frames {
-        entries.iter_mut().for_each(|entry| entry.frames = None);
-    }
+fn write_json(path: &Path, args: &Args, mut evaluation: Evaluation) -> anyhow::Result<()> {
     let command: Vec<String> = std::env::args().collect();
     let datasets: Vec<String> = args.recordings.iter().map(|path| path.display().to_string()).collect();
-    let object = json!({
+    if !args.frames {
+        evaluation.entries.iter_mut().for_each(|entry| entry.frames = None);
+    }
+    let mut object = json!({
         "program": env!("CARGO_PKG_VERSION"),
         "command": command,
         "datasets": datasets,
-        "results": entries,
+        "results": evaluation.entries,
+        "statistics": evaluation.statistics,
     });
+    if args.frames {
+        object["assignments"] = json!(evaluation.assignments);
+    }
     write_bytes_atomically(path, format!("{object:#}\n").as_bytes())?;
     Ok(())
 }

@@ -4,25 +4,14 @@ use std::path::{Path, PathBuf};
 
 use super::BadArgument;
 use super::progress::Progress;
-use crate::evaluate::{Entry, Sequence};
+use crate::evaluate::{Case, Evaluation};
 use crate::map::FeatureMap;
 use crate::recording::Recording;
-use crate::train::{Outcomes, Survey};
+use crate::train::{Outcomes, Survey, Trial};
 use crate::types::PositionM;
 
 /// There is none.
 pub enum Reporter {}
-
-/// What a trial was run on: see `report::TrialFacts`.
-pub struct TrialFacts<'a> {
-    pub recipe: &'a crate::map::Recipe,
-    pub split: &'a crate::train::Split,
-    pub split_name: &'a str,
-    pub seed: Option<u64>,
-    pub grid_step_m: f64,
-    pub learned_m: &'a [PositionM],
-    pub truth_m: &'a [PositionM],
-}
 
 impl Reporter {
     pub fn new(_: &Path, _: bool, _: Vec<(String, String)>) -> anyhow::Result<Self> {
@@ -35,19 +24,19 @@ impl Reporter {
         match *self {}
     }
 
-    pub fn take_trial(&mut self, _: &Survey, _: &TrialFacts, _: &Outcomes) -> anyhow::Result<()> {
+    pub fn take_trial(&mut self, _: &Survey, _: &Case, _: &Trial, _: &Outcomes) -> anyhow::Result<()> {
         match *self {}
     }
 
-    pub fn take_map(&mut self, _: &Survey, _: &Path, _: &FeatureMap, _: &[Sequence]) -> anyhow::Result<()> {
+    pub fn take_map(&mut self, _: &Survey, _: &Path, _: &FeatureMap, _: &[Recording]) -> anyhow::Result<()> {
         match *self {}
     }
 
-    pub fn take_entries(&mut self, _: &[Entry]) {
+    pub fn take_evaluation(&mut self, _: &Evaluation) {
         match *self {}
     }
 
-    pub fn write(self, _: &[Recording], _: &[Recording], _: &Progress) -> anyhow::Result<PathBuf> {
+    pub fn write(self, _: &[Recording], _: &Progress) -> anyhow::Result<PathBuf> {
         match self {}
     }
 }

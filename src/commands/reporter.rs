@@ -9,11 +9,11 @@ use sha2::{Digest, Sha256};
 
 use super::BadArgument;
 use super::progress::Progress;
-use crate::evaluate::{Entry, Sequence};
+use crate::evaluate::{Case, Evaluation};
 use crate::map::FeatureMap;
 use crate::recording::Recording;
-use crate::report::{Dataset, MapFacts, Report, ReportStep, TrialFacts, utc_text};
-use crate::train::{Outcomes, Survey};
+use crate::report::{Dataset, MapFacts, Report, ReportStep, utc_text};
+use crate::train::{Outcomes, Survey, Trial};
 use crate::types::PositionM;
 
 /// A report in the making.
@@ -21,6 +21,8 @@ pub struct Reporter {
     folder: PathBuf,
     settings: Vec<(String, String)>,
     datasets: Vec<Dataset>,
+    /// What the map was learned from.
+    learned: Vec<Recording>,
 }
 
 impl Reporter {
@@ -30,7 +32,7 @@ impl Reporter {
     /// There is something that must not be replaced, or a report, and `force` is not given.
     pub fn new(folder: &Path, force: bool, settings: Vec<(String, String)>) -> anyhow::Result<Self> {
         check_folder(folder, force)?;
-        Ok(Self { folder: folder.into(), settings, datasets: Vec::new() })
+        Ok(Self { folder: folder.into(), settings, datasets: Vec::new(), learned: Vec::new() })
     }
 
     /// What follows is of this recording.
@@ -40,39 +42,43 @@ impl Reporter {
         Ok(())
     }
 
-    pub fn take_trial(&mut self, survey: &Survey, facts: &TrialFacts, outcomes: &Outcomes) -> anyhow::Result<()> {
-        self.current().take_trial(survey, facts, outcomes).context("for the report")
+    /// What a recipe brought in the plain variant of a split.
+    pub fn take_trial(
+        &mut self,
+        survey: &Survey,
+        case: &Case,
+        trial: &Trial,
+        outcomes: &Outcomes,
+    ) -> anyhow::Result<()> {
+        self.current().take_trial(survey, case, trial, outcomes).context("looking into a trial for the report")
     }
 
+    /// The map that is measured against, and the recordings that it was learned from, as far as they are known.
     pub fn take_map(
         &mut self,
         survey: &Survey,
         path: &Path,
         map: &FeatureMap,
-        sequences: &[Sequence],
+        learned: &[Recording],
     ) -> anyhow::Result<()> {
         let (path, sha256) = (path.display().to_string(), sha256_of(path)?);
         let facts = MapFacts { path, sha256, info: map.info.clone(), cells: map.cells.len() };
-        self.current().take_map(survey, map, facts, sequences);
+        self.current().take_map(survey, map, facts);
+        self.learned = learned.to_vec();
         Ok(())
     }
 
     /// The results of the recording that was begun last.
-    pub fn take_entries(&mut self, entries: &[Entry]) {
-        self.current().entries = entries.to_vec();
+    pub fn take_evaluation(&mut self, evaluation: &Evaluation) {
+        self.current().take_evaluation(evaluation);
     }
 
     fn current(&mut self) -> &mut Dataset {
         self.datasets.last_mut().expect("a recording was begun")
     }
 
-    /// Writes the report; returns its page. `surveys` are recordings that the map was learned from.
-    pub fn write(
-        self,
-        recordings: &[Recording],
-        surveys: &[Recording],
-        progress: &Progress,
-    ) -> anyhow::Result<PathBuf> {
+    /// Writes the report; returns its page.
+    pub fn write(self, recordings: &[Recording], progress: &Progress) -> anyhow::Result<PathBuf> {
         let now_s = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
         let report = Report {
             program: env!("CARGO_PKG_VERSION").into(),
@@ -88,7 +94,7 @@ impl Reporter {
         };
         let context = || format!("writing the report {}", self.folder.display());
         remove_old(&self.folder).with_context(context)?;
-        report.write(&self.folder, recordings, surveys, on_step).with_context(context)?;
+        report.write(&self.folder, recordings, &self.learned, on_step).with_context(context)?;
         Ok(self.folder.join(PAGE))
     }
 }

@@ -161,13 +161,6 @@ pub fn bad_argument(error: TrialError) -> anyhow::Error {
     }
 }
 
-/// The grid step for an area when none is asked for: 0.1 m where the positions lie within a room, 1 m outdoors.
-pub fn default_grid_step_m(positions_m: &[PositionM]) -> f64 {
-    const ROOM_M: f64 = 20.0;
-    let extent_m = crate::gp::fit::extent_m(positions_m);
-    if extent_m[0].hypot(extent_m[1]) < ROOM_M { 0.1 } else { 1.0 }
-}
-
 /// A distance, as an argument.
 pub fn parse_spacing_m(text: &str) -> Result<f64, String> {
     let spacing_m = text.parse().ok().filter(|spacing_m| (0.0..=1000.0).contains(spacing_m));

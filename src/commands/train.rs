@@ -10,12 +10,12 @@ use super::map_report;
 use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
 use super::survey::{
-    appearances, bad_argument, default_grid_step_m, in_one_place, open_recordings, parse_descriptor, parse_spacing_m,
-    read_to_learn, read_to_match,
+    appearances, bad_argument, in_one_place, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
+    read_to_match,
 };
 use super::{BadArgument, DONE, print};
 use crate::features::Descriptor;
-use crate::map::{Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
+use crate::map::{Grid, Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
 use crate::recording::write_bytes_atomically;
 use crate::train::{TrainSettings, train, update};
 
@@ -95,7 +95,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let settings = TrainSettings {
         split: args.split,
         seed: args.seed,
-        grid_step_m: args.grid_step_m.unwrap_or_else(|| default_grid_step_m(&survey.positions_m())),
+        grid_step_m: args.grid_step_m.unwrap_or_else(|| Grid::usual_step_m(&survey.positions_m())),
         within_m: args.within_m,
         smoothing: args.smooth.unwrap_or(Smoothing::usual(args.recipe)),
     };

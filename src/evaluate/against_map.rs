@@ -3,10 +3,13 @@
 use faer::Mat;
 use rayon::prelude::*;
 
-use super::sequence::{Sequence, sequences};
+use super::entry::Entry;
+use super::protocol::{chosen_on, compression};
+use super::sequence::{Sequence, SequenceFigures, sequences};
 use crate::features::COMPASS_BYTES;
 use crate::localize::{MapFields, Observation};
 use crate::map::FeatureMap;
+use crate::metrics::{ErrorFigures, component_median};
 use crate::train::{Survey, covers, locate};
 use crate::types::PositionM;
 
@@ -30,6 +33,56 @@ pub struct AgainstMap {
     pub single: Vec<MapOutcome>,
     /// The frames one after the other; empty where they have no time.
     pub sequences: Vec<Sequence>,
+}
+
+/// What all rows of the drive `dataset` on a map have in common.
+pub(super) fn base_entry(dataset: &str, survey: &Survey, map: &FeatureMap) -> Entry {
+    Entry {
+        dataset: dataset.into(),
+        estimator: "single",
+        n_learning: map.positions_m.len(),
+        n_learned_from: map.positions_m.len(),
+        n_test: survey.len(),
+        ..Entry::default()
+    }
+}
+
+/// The rows of a drive, named `dataset`, on a map: the groups by themselves, fused, and one frame after the other.
+pub fn map_entries(dataset: &str, survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> Vec<Entry> {
+    let indices: Vec<usize> = survey.frames.iter().map(|frame| frame.index).collect();
+    let base = Entry {
+        recipe: Some(map.info.recipe.name()),
+        chosen_on: chosen_on(map.info.selection),
+        ..base_entry(dataset, survey, map)
+    };
+    let know_nothing_m = component_median(&map.positions_m);
+    let outcomes = against_map(survey, map, truth_m);
+    let of_single = |outcome: MapOutcome| {
+        let entry = Entry {
+            features: outcome.features,
+            m: Some(outcome.m),
+            rank: Some(outcome.rank),
+            kept: Some(outcome.kept),
+            compression: compression(outcome.m, outcome.kept),
+            coverage_95: outcome.coverage_95,
+            ..base.clone()
+        };
+        let figures = ErrorFigures::of(&outcome.estimates_m, truth_m, know_nothing_m);
+        entry.with_figures(figures).with_frames(&indices, truth_m, &outcome.estimates_m)
+    };
+    let mut entries: Vec<Entry> = outcomes.single.into_iter().map(of_single).collect();
+    let stamps_ns: Vec<u64> = survey.frames.iter().map(|frame| frame.stamp_ns).collect();
+    let yaws_rad: Vec<Option<f64>> = survey.frames.iter().map(|frame| frame.yaw_rad).collect();
+    for sequence in &outcomes.sequences {
+        let said = sequence.poses.iter().zip(truth_m).filter_map(|(pose, truth_m)| Some((pose.as_ref()?, *truth_m)));
+        let (estimates_m, said_truth_m): (Vec<_>, Vec<_>) = said.map(|(pose, truth)| (pose.position_m, truth)).unzip();
+        let entry = Entry { features: sequence.estimator.into(), estimator: sequence.estimator, ..base.clone() };
+        let entry = entry.with_figures(ErrorFigures::of(&estimates_m, &said_truth_m, know_nothing_m));
+        let figures = SequenceFigures::of(sequence, &stamps_ns, truth_m, &yaws_rad);
+        let entry = figures.map_or(entry.clone(), |figures| entry.with_sequence(&figures));
+        entries.push(entry.with_poses(&indices, truth_m, sequence));
+    }
+    entries
 }
 
 /// Estimates for every frame of `survey`, which in truth are at `truth_m`.

@@ -38,6 +38,11 @@ pub struct Entry {
     pub p90_m: Option<f64>,
     pub p95_m: Option<f64>,
     pub share_over_10m: Option<f64>,
+    /// Share of all test frames whose estimate errs by so much at most.
+    pub recall_1m: Option<f64>,
+    pub recall_2m: Option<f64>,
+    pub recall_5m: Option<f64>,
+    pub recall_10m: Option<f64>,
     pub skill: Option<f64>,
     pub heading_median_deg: Option<f64>,
     /// Share of the test frames that have an estimate; the first of them, since the first frame.
@@ -46,6 +51,12 @@ pub struct Entry {
     pub first_localized_m: Option<f64>,
     pub nees_mean: Option<f64>,
     pub coverage_95: Option<f64>,
+    /// What features or settings were chosen on: `validation`, `folds` of the frames learned from, or nothing. Never the
+    /// test frames.
+    pub chosen_on: Option<&'static str>,
+    /// Of a bag of words: learning images that are asked, and share of the test frames with the right label (eq. 15).
+    pub neighbours: Option<usize>,
+    pub classified_share: Option<f64>,
     pub bic_all: Option<f64>,
     pub bic_kept: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -53,7 +64,7 @@ pub struct Entry {
 }
 
 /// One frame's estimate.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct FrameEntry {
     pub index: usize,
     pub truth_e_m: f64,
@@ -78,6 +89,10 @@ impl Entry {
             p90_m: figures.map(|f| f.p90_m),
             p95_m: figures.map(|f| f.p95_m),
             share_over_10m: figures.map(|f| f.share_over_10m),
+            recall_1m: figures.map(|f| f.recall[0]),
+            recall_2m: figures.map(|f| f.recall[1]),
+            recall_5m: figures.map(|f| f.recall[2]),
+            recall_10m: figures.map(|f| f.recall[3]),
             skill: figures.map(|f| f.skill),
             emax_test_m: figures.map(|f| f.max_m),
             ..self
@@ -101,9 +116,14 @@ impl Entry {
         Self { frames: Some(frames.collect()), ..self }
     }
 
-    /// The figures of a drive as a whole.
+    /// The figures of a drive as a whole. Frames without a position are not recalled.
     pub fn with_sequence(self, figures: &SequenceFigures) -> Self {
+        let of_all = |recall: Option<f64>| recall.map(|recall| recall * figures.share);
         Self {
+            recall_1m: of_all(self.recall_1m),
+            recall_2m: of_all(self.recall_2m),
+            recall_5m: of_all(self.recall_5m),
+            recall_10m: of_all(self.recall_10m),
             heading_median_deg: figures.heading_median_deg,
             localized_share: Some(figures.share),
             first_localized_s: Some(figures.first_s),
@@ -305,6 +325,13 @@ mod tests {
             "p90_m",
             "p95_m",
             "share_over_10m",
+            "recall_1m",
+            "recall_2m",
+            "recall_5m",
+            "recall_10m",
+            "chosen_on",
+            "neighbours",
+            "classified_share",
             "skill",
             "heading_median_deg",
             "localized_share",

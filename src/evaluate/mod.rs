@@ -1,9 +1,29 @@
-//! How good is it? Error figures, the paper's tables, and other drives against a map.
+//! How good is it? Error figures, the paper's tables, and other drives against a map; what to compare with, and how far
+//! the figures can be trusted.
 
 mod against_map;
+pub mod baselines;
 mod entry;
+mod map_baselines;
+mod protocol;
 mod sequence;
+pub mod statistics;
 
-pub use against_map::{AgainstMap, MapOutcome, against_map};
+pub use against_map::{AgainstMap, MapOutcome, against_map, map_entries};
+pub use baselines::WordAssignment;
 pub use entry::{Entry, FrameEntry, LEGEND, table};
+pub use map_baselines::MapComparison;
+pub use protocol::{Case, CaseResults, Protocol, Variant};
 pub use sequence::{Sequence, SequenceFigures, SequencePose};
+pub use statistics::Statistics;
+
+/// All that an evaluation brings.
+#[derive(Debug, Clone, Default)]
+pub struct Evaluation {
+    /// Every one with its frames.
+    pub entries: Vec<Entry>,
+    /// Of all entries.
+    pub statistics: Statistics,
+    /// One a bag of words and case.
+    pub assignments: Vec<WordAssignment>,
+}

@@ -22,6 +22,7 @@ use serde::{Deserialize, Serialize};
 use crate::panorama::Panorama;
 pub use gradient::{COMPASS_BYTES, COMPASS_HARMONICS};
 use gradient::{GradientSignature, Sign};
+pub use patches::{COEFFICIENTS as PATCH_COEFFICIENTS, Patch};
 use patches::{KernelMean, Patches};
 use steerable::{Response, SteerablePyramid};
 use words::PatchWords;
@@ -200,6 +201,14 @@ impl Describer {
                 Descriptor::PatchWords => self.words.describe(self.patches.all(), properties),
             }
         }
+    }
+
+    /// The patches of `panorama`, from all around and every elevation: the local descriptors that
+    /// [`Descriptor::Patches`] and [`Descriptor::PatchWords`] are made of.
+    pub fn patches(&mut self, panorama: &Panorama) -> &[Patch] {
+        self.gradient.look(panorama);
+        self.patches.look(self.gradient.orientations());
+        self.patches.all()
     }
 
     /// The compass signature of `panorama`, [`COMPASS_BYTES`] long. Costs next to nothing right after a description of the

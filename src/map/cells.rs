@@ -139,6 +139,13 @@ impl CandidateCells {
 }
 
 impl Grid {
+    /// The step for an area when none is asked for: 0.1 m where the positions lie within a room, 1 m outdoors.
+    pub fn usual_step_m(positions: &[PositionM]) -> f64 {
+        const ROOM_M: f64 = 20.0;
+        let extent_m = crate::gp::fit::extent_m(positions);
+        if extent_m[0].hypot(extent_m[1]) < ROOM_M { 0.1 } else { 1.0 }
+    }
+
     /// A grid that training could have made.
     fn is_plausible(&self) -> bool {
         let cells = u64::from(self.columns) * u64::from(self.rows);

@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 
 use super::figure::slug;
-use super::insight::{FrameAnswer, Insight, InsightError, TrialFacts, answers_of_sequence};
+use super::insight::{FrameAnswer, Insight, InsightError};
 use super::photograph::Photograph;
-use crate::evaluate::{Entry, Sequence};
+use crate::evaluate::{Case, Entry, Evaluation, Statistics, WordAssignment};
 use crate::map::{FeatureMap, MapInfo};
 use crate::recording::Recording;
-use crate::train::{Outcomes, Split, Survey, SurveyedFrame};
-use crate::types::{DonutCalibration, LocalizationState, PositionM};
+use crate::train::{Outcomes, Split, Survey, SurveyedFrame, Trial};
+use crate::types::{DonutCalibration, PositionM};
 
 #[derive(Debug, Clone)]
 pub struct Dataset {
@@ -27,6 +27,8 @@ pub struct Dataset {
     pub insights: Vec<Insight>,
     pub eliminations: Vec<EliminationRun>,
     pub sequences: Vec<ShownSequence>,
+    pub statistics: Statistics,
+    pub assignments: Vec<WordAssignment>,
     /// The map that was measured against.
     pub map: Option<MapFacts>,
     /// By row.
@@ -79,7 +81,19 @@ pub struct ShownSequence {
     /// Of the frames with a pose.
     pub answers: Vec<FrameAnswer>,
     /// One a frame; `None` for an estimator that has none.
-    pub states: Vec<Option<LocalizationState>>,
+    pub states: Vec<Option<&'static str>>,
+}
+
+impl ShownSequence {
+    /// `row_of` tells the row of a frame's number.
+    fn of(entry: &Entry, row_of: impl Fn(usize) -> Option<usize>) -> Self {
+        let frames = || entry.frames.iter().flatten();
+        Self {
+            estimator: entry.estimator,
+            answers: frames().filter_map(|frame| FrameAnswer::of_pose(frame, row_of(frame.index)?)).collect(),
+            states: frames().map(|frame| frame.state).collect(),
+        }
+    }
 }
 
 #[derive(Debug, Clone)]
@@ -152,50 +166,58 @@ impl Dataset {
             insights: Vec::new(),
             eliminations: Vec::new(),
             sequences: Vec::new(),
+            statistics: Statistics::default(),
+            assignments: Vec::new(),
             map: None,
             photographs: BTreeMap::new(),
         }
     }
 
     /// Keeps what is shown of a trial of the plain variant.
-    pub fn take_trial(&mut self, survey: &Survey, facts: &TrialFacts, outcomes: &Outcomes) -> Result<(), InsightError> {
-        let is_of_case = |split: &ShownSplit| split.name == facts.split_name && split.seed == facts.seed;
-        let is_first_seed = !self.splits.iter().any(|split| split.name == facts.split_name && split.seed != facts.seed);
-        if !self.splits.iter().any(is_of_case) {
-            let (name, seed) = (facts.split_name.to_owned(), facts.seed);
-            self.splits.push(ShownSplit { name, seed, split: facts.split.clone() });
+    pub fn take_trial(
+        &mut self,
+        survey: &Survey,
+        case: &Case,
+        trial: &Trial,
+        outcomes: &Outcomes,
+    ) -> Result<(), InsightError> {
+        let (name, seed) = (&case.split_name, case.seed);
+        let is_first_seed = !self.splits.iter().any(|split| split.name == *name && split.seed != seed);
+        if !self.splits.iter().any(|split| split.name == *name && split.seed == seed) {
+            self.splits.push(ShownSplit { name: name.clone(), seed, split: trial.split.clone() });
         }
-        let test_m: Vec<PositionM> = facts.split.test.iter().map(|&row| facts.truth_m[row]).collect();
+        let test_m: Vec<PositionM> = trial.split.test.iter().map(|&row| self.truth_m[row]).collect();
         for row in &outcomes.rows {
             let Some(elimination) = &row.elimination else { continue };
             self.eliminations.push(EliminationRun {
                 features: row.features.clone(),
-                split: facts.split_name.into(),
-                seed: facts.seed,
+                split: name.clone(),
+                seed,
                 validation_rmse_m: elimination.path.rmse_m.clone(),
                 test_rmse_m: elimination.test_m.iter().map(|estimates_m| rmse_m(estimates_m, &test_m)).collect(),
                 kept: row.kept,
             });
         }
-        if is_first_seed && let Some(insight) = Insight::of_trial(survey, facts, outcomes)? {
+        if is_first_seed && let Some(insight) = Insight::of_trial(survey, case, trial, &self.truth_m, outcomes)? {
             self.insights.push(insight);
         }
         Ok(())
     }
 
-    /// Keeps what is shown of a drive against a map.
-    pub fn take_map(&mut self, survey: &Survey, map: &FeatureMap, facts: MapFacts, sequences: &[Sequence]) {
-        let indices: Vec<usize> = self.frames.iter().map(|frame| frame.index).collect();
+    /// Keeps what is shown of a map.
+    pub fn take_map(&mut self, survey: &Survey, map: &FeatureMap, facts: MapFacts) {
         self.insights.push(Insight::of_map(survey, map, &self.truth_m));
-        self.sequences = sequences
-            .iter()
-            .map(|sequence| ShownSequence {
-                estimator: sequence.estimator,
-                answers: answers_of_sequence(sequence, &indices, &self.truth_m),
-                states: sequence.states.clone(),
-            })
-            .collect();
         self.map = Some(facts);
+    }
+
+    /// Keeps the results.
+    pub fn take_evaluation(&mut self, evaluation: &Evaluation) {
+        self.entries = evaluation.entries.clone();
+        self.statistics = evaluation.statistics.clone();
+        self.assignments = evaluation.assignments.clone();
+        let row_of = |index: usize| self.frames.iter().position(|frame| frame.index == index);
+        let of_drive = |entry: &&Entry| entry.estimator != "single";
+        self.sequences = self.entries.iter().filter(of_drive).map(|entry| ShownSequence::of(entry, row_of)).collect();
     }
 
     /// The insight that pictures of single frames are of: the default recipe where there is one.

@@ -2,12 +2,12 @@
 
 use rayon::prelude::*;
 
-use crate::evaluate::Sequence;
+use crate::evaluate::{Case, FrameEntry};
 use crate::features::Descriptor;
 use crate::gp::{GpError, Hyperparameters, LearningPositions};
 use crate::localize::{FieldOnCells, MapFields};
-use crate::map::{CandidateCells, CellsError, FeatureMap, GroupHyperparameters, NoiseModel, Recipe};
-use crate::train::{LearnedGroup, Outcomes, Split, Survey, credible_level, locate};
+use crate::map::{CandidateCells, CellsError, FeatureMap, GroupHyperparameters, NoiseModel};
+use crate::train::{LearnedGroup, Outcomes, Survey, Trial, credible_level, locate};
 use crate::types::{PositionCovariance, PositionM, distance_m};
 
 /// Features of a group that are shown.
@@ -68,6 +68,17 @@ impl FrameAnswer {
     pub fn error_m(&self) -> f64 {
         distance_m(self.truth_m, self.estimate_m)
     }
+
+    /// Of a frame that came with a pose, the frame at `row`.
+    pub fn of_pose(frame: &FrameEntry, row: usize) -> Option<Self> {
+        let (truth_m, estimate_m) = ([frame.truth_e_m, frame.truth_n_m], [frame.est_e_m?, frame.est_n_m?]);
+        let covariance =
+            PositionCovariance { ee_m2: frame.cov_ee_m2?, en_m2: frame.cov_en_m2?, nn_m2: frame.cov_nn_m2? };
+        let nees = nees(&covariance, estimate_m, truth_m);
+        // Of a normal distribution with two dimensions.
+        let credible_level = 1.0 - (-0.5 * nees).exp();
+        Some(Self { row, index: frame.index, truth_m, estimate_m, covariance, credible_level, nees })
+    }
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -78,38 +89,31 @@ pub enum InsightError {
     Cells(#[from] CellsError),
 }
 
-/// What a trial was run on.
-#[derive(Debug, Clone, Copy)]
-pub struct TrialFacts<'a> {
-    pub recipe: &'a Recipe,
-    pub split: &'a Split,
-    pub split_name: &'a str,
-    pub seed: Option<u64>,
-    pub grid_step_m: f64,
-    /// Positions that were learned from, and true ones: one a frame of the survey.
-    pub learned_m: &'a [PositionM],
-    pub truth_m: &'a [PositionM],
-}
-
 impl Insight {
     /// Into a trial of the protocol. `None` where no feature was kept.
-    pub fn of_trial(survey: &Survey, facts: &TrialFacts, outcomes: &Outcomes) -> Result<Option<Self>, InsightError> {
-        let mut learning_rows = facts.split.learning.clone();
-        if facts.recipe.refit {
-            learning_rows.extend(&facts.split.validation);
+    pub fn of_trial(
+        survey: &Survey,
+        case: &Case,
+        trial: &Trial,
+        truth_m: &[PositionM],
+        outcomes: &Outcomes,
+    ) -> Result<Option<Self>, InsightError> {
+        let mut learning_rows = trial.split.learning.clone();
+        if trial.recipe.refit {
+            learning_rows.extend(&trial.split.validation);
             learning_rows.sort_unstable();
         }
-        let learning_m: Vec<PositionM> = learning_rows.iter().map(|&row| facts.learned_m[row]).collect();
+        let learning_m: Vec<PositionM> = learning_rows.iter().map(|&row| trial.recorded_m[row]).collect();
         let learning = LearningPositions::of_recordings(learning_m.clone(), &survey.recordings_of(&learning_rows));
-        let cells = CandidateCells::around(&learning_m, facts.grid_step_m, None)?;
+        let cells = CandidateCells::around(&learning_m, trial.grid_step_m, None)?;
         let centers_m = cells.centers_m();
         let mut surfaces = Vec::new();
-        let mut rows: Vec<Vec<f32>> = vec![vec![0.0; cells.len()]; facts.split.test.len()];
+        let mut rows: Vec<Vec<f32>> = vec![vec![0.0; cells.len()]; trial.split.test.len()];
         for group in outcomes.groups.iter().filter(|group| group.features() > 0) {
             let (mean, variance) = group.predict(&learning, &centers_m)?;
             surfaces.push(surfaces_of(group, cells.len(), &mean, &variance));
             let field = FieldOnCells::new(group.features(), cells.len(), mean, &variance);
-            let properties = survey.properties(group.recipe.descriptor, &facts.split.test);
+            let properties = survey.properties(group.recipe.descriptor, &trial.split.test);
             let features = group.scaling.apply(properties.as_ref());
             let (noise, weight): (NoiseModel, f32) = (group.recipe.noise, group.recipe.weight as f32);
             rows.par_iter_mut().enumerate().for_each_init(Vec::new, |scratch, (i, row)| {
@@ -121,17 +125,17 @@ impl Insight {
             return Ok(None);
         }
         let temperature = outcomes.temperature.unwrap_or(1.0);
-        let refine = facts.recipe.refine;
-        let frames: Vec<FrameAnswer> = (facts.split.test.par_iter().zip(&rows))
+        let refine = trial.recipe.refine;
+        let frames: Vec<FrameAnswer> = (trial.split.test.par_iter().zip(&rows))
             .map(|(&row, log_likelihood)| {
                 let index = survey.frames[row].index;
-                answer(&cells, log_likelihood, temperature, refine, row, index, facts.truth_m[row])
+                answer(&cells, log_likelihood, temperature, refine, row, index, truth_m[row])
             })
             .collect();
         let likelihoods = shown_frames(&frames).into_iter().map(|i| (frames[i].row, rows[i].clone())).collect();
         Ok(Some(Self {
-            recipe: facts.recipe.name.name(),
-            split: Some((facts.split_name.into(), facts.seed)),
+            recipe: trial.recipe.name.name(),
+            split: Some((case.split_name.clone(), case.seed)),
             cells,
             learning_m,
             learning_rows,
@@ -294,26 +298,6 @@ fn shown_frames(frames: &[FrameAnswer]) -> Vec<usize> {
     let mut shown = vec![order[last / 2], order[(0.95 * last as f64).round() as usize], order[last]];
     shown.dedup();
     shown
-}
-
-/// A sequence's poses as answers, for frames that have one.
-pub fn answers_of_sequence(sequence: &Sequence, survey_indices: &[usize], truth_m: &[PositionM]) -> Vec<FrameAnswer> {
-    let poses = sequence.poses.iter().enumerate().filter_map(|(row, pose)| Some((row, pose.as_ref()?)));
-    poses
-        .map(|(row, pose)| {
-            let value = nees(&pose.covariance, pose.position_m, truth_m[row]);
-            FrameAnswer {
-                row,
-                index: survey_indices[row],
-                truth_m: truth_m[row],
-                estimate_m: pose.position_m,
-                covariance: pose.covariance,
-                // Of a normal distribution with two dimensions.
-                credible_level: 1.0 - (-0.5 * value).exp(),
-                nees: value,
-            }
-        })
-        .collect()
 }
 
 #[cfg(test)]

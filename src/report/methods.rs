@@ -2,6 +2,7 @@
 
 use super::chart::color::{BLACK, BLUE, GREEN, MUTED, ORANGE, PURPLE, SKY, VERMILION};
 use super::dataset::Dataset;
+use crate::evaluate::statistics::{Comparison, MethodStatistics, Statistics};
 use crate::evaluate::{Entry, FrameEntry};
 use crate::features::Descriptor;
 use crate::types::PositionM;
@@ -87,6 +88,28 @@ impl<'a> Method<'a> {
         let mut errors_m: Vec<f64> = self.errors().iter().map(|frame| frame.error_m).collect();
         errors_m.sort_unstable_by(f64::total_cmp);
         errors_m
+    }
+
+    /// What bootstrap draws say of it.
+    pub fn statistics<'b>(&self, of: &'b Statistics) -> Option<&'b MethodStatistics> {
+        let first = self.entries[0];
+        of.methods.iter().find(|method| {
+            let (section, found) = (&method.section, &method.method);
+            section.split == first.split
+                && (section.noisy, section.fixed) == (first.noisy, first.fixed)
+                && (found.recipe, &found.features, found.estimator) == (first.recipe, &first.features, first.estimator)
+        })
+    }
+
+    /// How it compares with the method that its table is about.
+    pub fn comparison<'b>(&self, of: &'b Statistics) -> Option<&'b Comparison> {
+        let first = self.entries[0];
+        of.comparisons.iter().find(|comparison| {
+            let (section, found) = (&comparison.section, &comparison.method);
+            section.split == first.split
+                && (section.noisy, section.fixed) == (first.noisy, first.fixed)
+                && (found.recipe, &found.features, found.estimator) == (first.recipe, &first.features, first.estimator)
+        })
     }
 
     /// Mean over the seeds.

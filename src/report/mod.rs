@@ -27,7 +27,7 @@ use serde_json::{Map, Value, json};
 
 pub use dataset::{Dataset, MapFacts};
 pub use gallery::GalleryError;
-pub use insight::{InsightError, TrialFacts};
+pub use insight::InsightError;
 
 use chart::picture::{PictureError, rasterized};
 use figure::{Drawn, Figure};
@@ -183,6 +183,7 @@ impl Report {
                 "facts": facts,
                 "map": dataset.map.as_ref().map(|map| json!({"file": map.path, "sha256": map.sha256, "info": map.info})),
                 "results": dataset.entries,
+                "statistics": dataset.statistics,
             })
         });
         json!({

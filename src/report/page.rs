@@ -58,15 +58,18 @@ pub fn html(report: &Report, parts: &[Part]) -> String {
     page
 }
 
+/// Figures before the tables.
+const FIRST: usize = 4;
+
 fn put_dataset(page: &mut String, dataset: &Dataset, part: &Part) {
     let _ = write!(page, "<section id=\"{}\"><h2>{}</h2>", dataset.id, escaped(&dataset.name));
     put_glance(page, dataset);
-    for drawn in &part.drawn[..part.drawn.len().min(3)] {
+    for drawn in &part.drawn[..part.drawn.len().min(FIRST)] {
         put_drawn(page, drawn);
     }
     page.push_str("<h3>Tables</h3>");
     part.tables.iter().for_each(|table| *page += &table.html());
-    for drawn in part.drawn.iter().skip(3) {
+    for drawn in part.drawn.iter().skip(FIRST) {
         put_drawn(page, drawn);
     }
     let _ = write!(page, "<h3 id=\"{}-gallery\">The worst frames</h3>", dataset.id);

@@ -7,6 +7,7 @@ mod axes;
 mod folded;
 mod group;
 pub mod noise_whitening;
+mod panoramas;
 pub mod perturbation;
 mod recognition;
 mod split;
@@ -18,7 +19,8 @@ mod trial;
 mod update;
 
 pub use group::{LearnError, LearnedGroup};
-pub use split::{Split, SplitError};
+pub use panoramas::{DescribedRecording, describe_panoramas};
+pub use split::{BLOCKS, Split, SplitError};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
 pub use temperature::{covers, credible_level};

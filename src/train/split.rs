@@ -33,7 +33,7 @@ pub enum SplitError {
 const LEARNING_SHARE: f64 = 0.5;
 const VALIDATION_SHARE: f64 = 0.25;
 /// Stretches that a blocked split cuts the drive into.
-const BLOCKS: usize = 20;
+pub const BLOCKS: usize = 20;
 
 impl Split {
     /// A seeded split of `n` frames into 50 % learning, 25 % validation and 25 % test.

@@ -3,13 +3,12 @@
 use std::collections::BTreeMap;
 
 use faer::Mat;
-use rayon::prelude::*;
 
+use super::panoramas::describe_panoramas;
 use super::perturbation::perturbed;
 use crate::features::{COMPASS_BYTES, Describer, Descriptor};
-use crate::jpeg::LumaDecoder;
-use crate::panorama::{Panorama, UnwrapTable};
-use crate::recording::{Recording, RecordingError, SurveyFrame};
+use crate::panorama::Panorama;
+use crate::recording::{Recording, RecordingError};
 use crate::types::{DonutCalibration, Geodetic, PositionM};
 
 /// All usable frames of one or more recordings of a place.
@@ -84,9 +83,6 @@ pub enum SurveyError {
     NoYaw { recording: String, index: usize },
 }
 
-/// Frames decoded and described at a time: bounds the memory.
-const BATCH: usize = 64;
-
 impl Survey {
     /// Reads every usable frame of `recordings`. `on_frames` is told how many more are done.
     ///
@@ -109,19 +105,7 @@ impl Survey {
         };
         for (number, recording) in recordings.iter().enumerate() {
             survey.check_same_lens(first, recording)?;
-            let mut batch: Vec<(SurveyFrame, Vec<u8>)> = Vec::with_capacity(BATCH);
-            for frame in recording.frames()? {
-                batch.push(frame?);
-                if batch.len() == BATCH {
-                    survey.describe(number, recording, options, &batch)?;
-                    on_frames(batch.len());
-                    batch.clear();
-                }
-            }
-            if !batch.is_empty() {
-                survey.describe(number, recording, options, &batch)?;
-                on_frames(batch.len());
-            }
+            survey.append(number, recording, options, &on_frames)?;
         }
         Ok(survey)
     }
@@ -145,54 +129,23 @@ impl Survey {
         Ok(())
     }
 
-    /// Decodes, unwraps and describes a batch in parallel and appends it.
-    fn describe(
+    /// Decodes, unwraps and describes the frames of a recording, and appends them.
+    fn append(
         &mut self,
         number: usize,
         recording: &Recording,
         options: &SurveyOptions,
-        batch: &[(SurveyFrame, Vec<u8>)],
+        on_frames: impl Fn(usize),
     ) -> Result<(), SurveyError> {
-        let name = || recording.path.display().to_string();
-        let in_frame = |index: usize| move |source| SurveyError::Frame { recording: name(), index, source };
         let first = self.frames.len();
-        let size_px = match self.frames.last() {
-            Some(frame) if frame.recording == number => self.image_size_px,
-            _ => {
-                let (frame, jpeg) = &batch[0];
-                let mut decoder = LumaDecoder::new();
-                let image = decoder.decode(jpeg).map_err(in_frame(frame.index))?;
-                (image.width_px, image.height_px)
-            }
+        let describe = |describer: &mut Describer, i: usize, panorama: &Panorama| {
+            describe_frame(describer, panorama, options, (first + i) as u64)
         };
-        self.image_size_px = size_px;
-        let table = UnwrapTable::build(&self.calibration, size_px.0, size_px.1)
-            .map_err(|source| SurveyError::Calibration { recording: name(), source })?;
-
-        let described: Vec<DescribedFrame> = batch
-            .par_iter()
-            .enumerate()
-            .map_init(
-                || (LumaDecoder::new(), Describer::new(), Panorama::zeros()),
-                |(decoder, describer, panorama), (i, (frame, jpeg))| {
-                    let image = decoder.decode_needed(jpeg, table.needed()).map_err(in_frame(frame.index))?;
-                    let found = (image.width_px, image.height_px);
-                    if found != size_px {
-                        let (recording, index) = (name(), frame.index);
-                        return Err(SurveyError::SizeChanged { recording, index, found, expected: size_px });
-                    }
-                    let turned = match (options.fixed, frame.yaw_rad) {
-                        (false, _) => 0,
-                        (true, Some(yaw_rad)) => table.columns_to_east(yaw_rad),
-                        (true, None) => return Err(SurveyError::NoYaw { recording: name(), index: frame.index }),
-                    };
-                    table.unwrap_into(image, turned, panorama);
-                    Ok(describe_frame(describer, panorama, options, (first + i) as u64))
-                },
-            )
-            .collect::<Result<_, SurveyError>>()?;
-
-        for ((frame, _), DescribedFrame { properties, compass }) in batch.iter().zip(described) {
+        let of_recording = describe_panoramas(recording, options.fixed, Describer::new, describe, on_frames)?;
+        if !of_recording.frames.is_empty() {
+            self.image_size_px = of_recording.image_size_px;
+        }
+        for (frame, DescribedFrame { properties, compass }) in of_recording.frames.iter().zip(of_recording.described) {
             self.compass.extend(compass);
             self.frames.push(SurveyedFrame {
                 recording: number,
@@ -232,6 +185,11 @@ impl Survey {
     /// Compass signatures of all frames, frame × [`COMPASS_BYTES`]; empty if they were not asked for.
     pub fn compass(&self) -> &[i8] {
         &self.compass
+    }
+
+    /// What the frames are described by.
+    pub fn descriptors(&self) -> Vec<Descriptor> {
+        self.properties.keys().copied().collect()
     }
 
     /// Properties of the frames at `rows`, n × d.

@@ -131,8 +131,8 @@ impl Plot {
         let rows = put_legend(&mut below, [0.0, TITLE_HEIGHT_PX], width, &legend);
         let mut top = TITLE_HEIGHT_PX + LEGEND_ROW_PX * rows as f64;
         if !y.label.is_empty() {
-            below.text([0.0, top + 11.0], &fitted(&y.label, LABEL.size_px, false, width), LABEL);
-            top += AXIS_LABEL_PX + 5.0;
+            below.text([0.0, top + 13.0], &fitted(&y.label, LABEL.size_px, false, width), LABEL);
+            top += AXIS_LABEL_PX + 6.0;
         } else {
             top += 8.0;
         }

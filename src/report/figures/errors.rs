@@ -55,29 +55,38 @@ pub fn comparison(dataset: &Dataset) -> Drawn {
             "median_m": method.entries.iter().map(|entry| entry.median_m).collect::<Vec<_>>(),
             "rmse_mean_m": method.mean(|entry| entry.rmse_m),
             "median_mean_m": method.mean(|entry| entry.median_m),
+            "rmse_interval_m": interval(dataset, method),
         })
     };
     let data: Vec<_> = shown.iter().flat_map(|(_, methods)| methods.iter().map(of_method)).collect();
     let caption = if shown.iter().all(|(_, methods)| methods.iter().all(|method| method.entries.len() == 1)) {
         "Left is better. The line runs from the median error (bar) to the root mean square error (diamond): a long line says \
-         that few gross errors make up most of the second."
+         that few gross errors make up most of the second. Black: the interval that holds 95 % of bootstrap draws of \
+         stretches of the drive."
     } else {
         "Left is better. Each dot is the RMSE of one seed of the split, the diamond their mean, the bar the mean of the \
-         median errors: a long way between bar and diamond says that few gross errors make up most of the RMSE."
+         median errors: a long way between bar and diamond says that few gross errors make up most of the RMSE. Black: the \
+         interval that holds 95 % of bootstrap draws of stretches of the drive and of seeds."
     };
     let figure = Figure::new(format!("{}-comparison", dataset.id), TITLE, caption, json!(data));
     let panel = |width_px: f64| {
-        let of_case = |(title, methods): &(String, Vec<Method>)| comparison_panel(title, &refs(methods), width_px);
+        let of_case =
+            |(title, methods): &(String, Vec<Method>)| comparison_panel(dataset, title, &refs(methods), width_px);
         shown.iter().map(of_case).collect()
     };
     figure.halves(panel).into()
+}
+
+/// The bootstrap interval of the RMSE \[m\].
+fn interval(dataset: &Dataset, method: &Method) -> Option<[f64; 2]> {
+    method.statistics(&dataset.statistics).map(|statistics| [statistics.rmse_m.low, statistics.rmse_m.high])
 }
 
 fn refs<'b, 'a>(methods: &'b [Method<'a>]) -> Vec<&'b Method<'a>> {
     methods.iter().collect()
 }
 
-fn comparison_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
+fn comparison_panel(dataset: &Dataset, title: &str, methods: &[&Method], width_px: f64) -> Panel {
     const ROW_PX: f64 = 34.0;
     let values = |of: fn(&Entry) -> Option<f64>| {
         methods.iter().flat_map(move |m| m.entries.iter().filter_map(move |e| of(e))).collect::<Vec<f64>>()
@@ -91,8 +100,9 @@ fn comparison_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
     spec.width_px = width_px;
     spec.area_height_px = ROW_PX * methods.len() as f64 + 6.0;
     spec.legend = vec![
-        LegendItem::new("RMSE, mean", Key::Diamond(Paint::fill(INK))),
-        LegendItem::new("RMSE of a seed", Key::Dot(Paint::fill(FAINT))),
+        LegendItem::new("RMSE", Key::Diamond(Paint::fill(INK))),
+        LegendItem::new("of a seed", Key::Dot(Paint::fill(FAINT))),
+        LegendItem::new("95 % interval", Key::Line(Paint::stroke(INK, 1.2))),
         LegendItem::new("median error", Key::Box(Paint::fill(INK).opacity(0.45))),
     ];
     if methods.iter().all(|method| method.entries.len() == 1) {
@@ -118,6 +128,13 @@ fn comparison_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel {
                 if let Some(rmse_m) = entry.rmse_m {
                     plot.dot(at(rmse_m), 2.6, Paint::fill(method.color).opacity(0.45));
                 }
+            }
+        }
+        if let Some([low, high]) = interval(dataset, method) {
+            let ends = [low, high].map(|value| plot.at(at(value)));
+            plot.inside.line(ends[0], ends[1], Paint::stroke(INK, 1.2));
+            for [x, y] in ends {
+                plot.inside.line([x, y - 3.5], [x, y + 3.5], Paint::stroke(INK, 1.2));
             }
         }
         let [x, y] = plot.at(at(rmse_m));

@@ -94,7 +94,8 @@ fn panorama_panel(photograph: &Photograph, fft: &[f32]) -> Panel {
     }
     let greatest = f64::from(fft.iter().copied().fold(1.0_f32, f32::max));
     let least = f64::from(fft.iter().copied().fold(f32::INFINITY, f32::min)).max(1.0);
-    let x = Axis::new("frequency, cycles an image", Scale::linear(0.0, 64.0));
+    let quarters = (0..=4).map(|i| (16.0 * f64::from(i), format!("{}", 16 * i)));
+    let x = Axis::new("frequency, cycles an image", Scale::linear(0.0, 64.0)).with_ticks(quarters);
     let y = Axis::new("magnitude, logarithmic", Scale::log(least, greatest));
     let mut spec = Spec::new("The paper’s FFT properties of it", x, y);
     spec.width_px = WIDTH_PX;

@@ -5,11 +5,13 @@ mod elimination;
 mod errors;
 mod frame;
 mod likelihood;
+mod paired;
 mod paths;
 mod reliability;
 mod splits;
 mod surfaces;
 mod timeline;
+mod words;
 
 pub use errors::{RECALL_AT_M, cases, recall_at};
 pub use frame::shown_row;
@@ -21,20 +23,22 @@ use crate::train::SurveyedFrame;
 
 /// All figures of a dataset, in the order they are read.
 pub fn all(dataset: &Dataset) -> Vec<Drawn> {
-    let mut drawn = Vec::new();
-    drawn.push(errors::comparison(dataset));
-    drawn.push(errors::distribution(dataset));
-    drawn.push(errors::recall(dataset));
-    drawn.push(paths::estimates(dataset));
-    drawn.push(paths::error_map(dataset));
-    drawn.push(timeline::timeline(dataset));
-    drawn.push(reliability::reliability(dataset));
-    drawn.push(likelihood::likelihood(dataset));
-    drawn.push(elimination::elimination(dataset));
-    drawn.push(surfaces::surfaces(dataset));
-    drawn.push(frame::frame(dataset));
-    drawn.push(splits::splits(dataset));
-    drawn
+    vec![
+        errors::comparison(dataset),
+        errors::distribution(dataset),
+        paired::paired(dataset),
+        errors::recall(dataset),
+        paths::estimates(dataset),
+        paths::error_map(dataset),
+        timeline::timeline(dataset),
+        reliability::reliability(dataset),
+        likelihood::likelihood(dataset),
+        elimination::elimination(dataset),
+        words::words(dataset),
+        surfaces::surfaces(dataset),
+        frame::frame(dataset),
+        splits::splits(dataset),
+    ]
 }
 
 /// The time of a frame since the first \[s\], where it is known.

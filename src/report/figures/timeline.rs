@@ -33,7 +33,7 @@ pub fn timeline(dataset: &Dataset) -> Drawn {
     let data = json!({
         "time_s": (0..dataset.frames.len()).map(|row| time_s(&dataset.frames, row)).collect::<Vec<_>>(),
         "index": dataset.frames.iter().map(|frame| frame.index).collect::<Vec<_>>(),
-        "state": filtered.states.iter().map(|state| state.map(LocalizationState::name)).collect::<Vec<_>>(),
+        "state": filtered.states,
         "single": dataset.insights[0].frames.iter().map(|a| json!([a.index, a.error_m()])).collect::<Vec<_>>(),
         "filtered": filtered.answers.iter().map(point_json).collect::<Vec<_>>(),
         "smoothed": dataset.sequences.iter().find(|s| s.estimator == "smoothed")
@@ -86,7 +86,7 @@ fn panel(dataset: &Dataset, filtered: &ShownSequence, width_px: f64) -> Panel {
         LocalizationState::Localized,
         LocalizationState::Lost,
     ];
-    let has_state = |state: &&LocalizationState| filtered.states.contains(&Some(**state));
+    let has_state = |state: &&LocalizationState| filtered.states.contains(&Some(state.name()));
     spec.legend = vec![
         LegendItem::new("single frames", Key::Dot(Paint::fill(MUTED).opacity(0.6))),
         LegendItem::new("filtered", Key::Line(Paint::stroke(BLUE, 2.0))),
@@ -130,12 +130,12 @@ fn panel(dataset: &Dataset, filtered: &ShownSequence, width_px: f64) -> Panel {
     let top = plot.area_at[1];
     for (row, state) in filtered.states.iter().enumerate() {
         let (from, to) = (plot.x.px(times[row]), plot.x.px(times.get(row + 1).copied().unwrap_or(end_s)));
-        if let Some(state) = state {
+        if let Some(state) = states.iter().find(|known| Some(known.name()) == *state) {
             band.rect([from, top], [(to - from).max(0.5) + 0.3, BAND_PX], Paint::fill(state_color(*state)));
         }
     }
     plot.inside.append(&band);
-    let localized = filtered.states.iter().filter(|state| **state == Some(LocalizationState::Localized)).count();
+    let localized = filtered.states.iter().filter(|state| **state == Some(LocalizationState::Localized.name())).count();
     let text =
         format!("{:.0} % of the frames localized", 100.0 * localized as f64 / filtered.states.len().max(1) as f64);
     let at = [plot.area_at[0] + 6.0, top + BAND_PX + 14.0];
