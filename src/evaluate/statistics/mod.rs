@@ -274,7 +274,7 @@ mod tests {
     /// A row of every seed: a quarter of the frames of a drive of 400, whose errors are `error_m` of the frame.
     fn rows(recipe: Option<&'static str>, features: &str, seeds: u64, error_m: impl Fn(usize) -> f64) -> Vec<Entry> {
         let of_seed = |seed: u64| {
-            let frames = (0..400).filter(|i| (i * 7 + seed as usize * 3) % 4 == 0);
+            let frames = (0..400).filter(|i| (i * 7 + seed as usize * 3).is_multiple_of(4));
             let errors_m: Vec<(usize, Option<f64>)> = frames.map(|i| (i, Some(error_m(i)))).collect();
             Entry { recipe, features: features.into(), split: Some("random".into()), ..entry(seed, &errors_m) }
         };
