@@ -31,6 +31,7 @@
 //! | [`train`] | recordings → map: recipes, splits, selection |
 //! | [`metrics`] | error figures of position estimates |
 //! | [`evaluate`] | the protocol's results and the paper's tables |
+//! | `report` | figures and the page that shows them |
 //! | [`world`] | simulated places, drives and receivers |
 //! | [`config`] | one TOML file → the settings that the modules own |
 //! | [`doctor`] | what is wrong with devices and computer, and what to do |
@@ -62,6 +63,8 @@ pub mod metrics;
 pub mod outputs;
 pub mod panorama;
 pub mod recording;
+#[cfg(feature = "report")]
+pub mod report;
 pub mod runtime;
 pub mod sync;
 pub mod train;

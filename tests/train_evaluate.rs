@@ -217,7 +217,7 @@ fn damaged_foreign_and_missing_maps_are_refused() {
     let folder = folder();
     let recording = recording(&folder, 16);
     let map = folder.path().join("area.map");
-    let small = ["--features", "gradient-coarse", "--grid-step-m", "10"];
+    let small = ["--features", "gradient", "--grid-step-m", "10"];
     omniloc().arg("train").arg(&recording).arg("--out").arg(&map).args(small).assert().success();
     let bytes = fs::read(&map).expect("readable");
     let mut flipped = bytes.clone();

@@ -43,6 +43,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     fs::create_dir_all(&args.out).with_context(|| format!("making the folder {}", args.out.display()))?;
     let map = args.out.join("town.map").display().to_string();
     let results = args.out.join("evaluation.json").display().to_string();
+    let report = args.out.join("report").display().to_string();
 
     let survey = record(args, &SURVEY, "a survey drive: camera and receiver become pairs of frame and position")?;
     step("what is in the recording", &["info", &survey])?;
@@ -52,7 +53,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     step(
         "every frame of that day, one by one, against the map: where was it? Errors against the receiver's positions, which \
          themselves err by 0.6 m on each axis",
-        &["evaluate", &other, "--map", &map, "--json", &results, "--force"],
+        &with_report(&["evaluate", &other, "--map", &map, "--json", &results, "--force"], &report, &survey),
     )?;
     print(&format!(
         "\nWhat this shows: a drive is recorded and synchronized, a map is learned from it, and on another day each single\n\
@@ -62,10 +63,25 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
          \x20          {other}\n\
          map        {map}   omniloc info {map}\n\
          results    {results}\n\
+         {}\
          {:.0} s\n",
+        report_line(&report),
         start.elapsed().as_secs_f64()
     ))?;
     Ok(DONE.into())
+}
+
+/// The arguments, and those that ask for a report where the program has them.
+fn with_report<'a>(arguments: &[&'a str], report: &'a str, survey: &'a str) -> Vec<&'a str> {
+    let more: &[&str] = if cfg!(feature = "report") { &["--report", report, "--survey", survey] } else { &[] };
+    [arguments, more].concat()
+}
+
+fn report_line(report: &str) -> String {
+    match cfg!(feature = "report") {
+        true => format!("report     {report}/index.html   open it in a browser\n"),
+        false => String::new(),
+    }
 }
 
 /// Drives once; returns the recording.

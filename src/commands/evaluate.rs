@@ -8,6 +8,7 @@ use serde_json::json;
 
 use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
+use super::reporter::Reporter;
 use super::survey::{
     bad_argument, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_to_match, read_truth,
 };
@@ -19,7 +20,7 @@ use crate::evaluate::{
 use crate::features::Descriptor;
 use crate::map::{FeatureMap, Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
 use crate::recording::{Recording, write_bytes_atomically};
-use crate::train::{Similarity, Split, Survey, TrackSmoother};
+use crate::train::{Outcomes, Similarity, Split, Survey, TrackSmoother, Trial};
 use crate::types::PositionM;
 
 /// Measure how well the method localizes on recordings
@@ -105,7 +106,11 @@ pub struct Args {
     /// Put every test frame's estimate into the JSON
     #[arg(long, requires = "json")]
     pub frames: bool,
-    /// Replace the JSON file if it exists
+    /// Write a page with figures and tables into this folder, with the figures as SVG and PNG and every number that is
+    /// drawn as JSON
+    #[arg(long, value_name = "DIR")]
+    pub report: Option<PathBuf>,
+    /// Replace the JSON file or the report if it exists
     #[arg(long)]
     pub force: bool,
 }
@@ -143,13 +148,19 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
     // Against a map every frame counts: only learning is costly.
     let spacing_m = args.spacing_m.or(args.map.as_ref().map(|_| 0.0));
     let recordings = open_recordings(&args.recordings, spacing_m)?;
+    let mut reporter =
+        args.report.as_ref().map(|folder| Reporter::new(folder, args.force, settings(args))).transpose()?;
     let progress = Progress::new();
     let mut all = Evaluation::default();
     for (number, recording) in recordings.iter().enumerate() {
-        let Evaluation { entries, statistics, assignments } = match &args.map {
-            Some(path) => on_map(args, path, recording, &progress)?,
-            None => protocol(args, recording, &progress)?,
+        let evaluation = match &args.map {
+            Some(path) => on_map(args, path, recording, reporter.as_mut(), &progress)?,
+            None => protocol(args, recording, reporter.as_mut(), &progress)?,
         };
+        if let Some(reporter) = &mut reporter {
+            reporter.take_evaluation(&evaluation);
+        }
+        let Evaluation { entries, statistics, assignments } = evaluation;
         progress.finish();
         print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
         print(&in_words(&entries))?;
@@ -160,7 +171,49 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         all.assignments.extend(assignments);
     }
     print(&format!("\n{LEGEND}\n{}", statistics::LEGEND))?;
+    if let Some(reporter) = reporter {
+        let page = reporter.write(&recordings, &progress)?;
+        progress.finish();
+        print(&format!("\nreport     {}\n", page.display()))?;
+    }
     Ok(all)
+}
+
+/// Options and what they were, for the report.
+fn settings(args: &Args) -> Vec<(String, String)> {
+    let list = |values: &mut dyn Iterator<Item = String>| values.collect::<Vec<_>>().join(", ");
+    let own = || "as the recipe has it".to_owned();
+    let name = |value: &dyn std::fmt::Debug| format!("{value:?}").to_lowercase();
+    let mut settings = vec![("recordings", list(&mut args.recordings.iter().map(|path| path.display().to_string())))];
+    match &args.map {
+        Some(map) => settings.push(("map", map.display().to_string())),
+        None => {
+            let features = list(&mut args.features.iter().map(|descriptor| descriptor.name().into()));
+            settings.extend([
+                ("recipes", list(&mut args.recipe.iter().map(|recipe| recipe.name().into()))),
+                ("feature types", if features.is_empty() { own() } else { features }),
+                ("selection", args.select.map_or_else(own, |select| name(&select))),
+                ("splits", list(&mut args.split.iter().cloned())),
+                ("seeds", list(&mut (args.seed..args.seed + args.seeds).map(|seed| seed.to_string()))),
+                ("variants of the random split", list(&mut args.variants.iter().map(|variant| name(variant)))),
+                ("smoothing of the track", args.smooth.map_or_else(own, |smooth| name(&smooth))),
+                (
+                    "grid step",
+                    args.grid_step_m.map_or("1 m outdoors, 0.1 m within 20 m".into(), |step_m| format!("{step_m} m")),
+                ),
+            ]);
+        }
+    }
+    settings.push(("baselines", list(&mut args.baselines.iter().map(|baseline| baseline.name().into()))));
+    let spacing = match (args.spacing_m, &args.map) {
+        (Some(spacing_m), _) => format!("{spacing_m} m"),
+        (None, Some(_)) => "none: every frame".into(),
+        (None, None) => "none up to 800 frames".into(),
+    };
+    settings.push(("least spacing of the frames", spacing));
+    let truth = args.truth.as_ref().map_or("positions as recorded".into(), |path| path.display().to_string());
+    settings.push(("errors are measured against", truth));
+    settings.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
 /// What a table has no columns for: how far the estimates against a map may be trusted.
@@ -193,7 +246,13 @@ fn in_words(entries: &[Entry]) -> String {
 }
 
 /// Every frame of `recording` against a map.
-fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) -> anyhow::Result<Evaluation> {
+fn on_map(
+    args: &Args,
+    path: &Path,
+    recording: &Recording,
+    reporter: Option<&mut Reporter>,
+    progress: &Progress,
+) -> anyhow::Result<Evaluation> {
     let map = open_map(path)?;
     if map.info.recordings.iter().any(|trained_on| trained_on.name == recording.name) {
         eprintln!("warning: the map was trained on {}: it knows these frames, and the errors flatter", recording.name);
@@ -206,6 +265,12 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
         .with_context(|| format!("{} against {}", recording.path.display(), path.display()))?;
     let truth_m = truth(args, &survey)?;
     let mut entries = map_entries(&recording.name, &survey, &map, &truth_m);
+    let learned = if args.survey.is_empty() { Vec::new() } else { open_surveys(args, path, &map)? };
+    if let Some(reporter) = reporter {
+        progress.begin("report: what the map knows", 1);
+        reporter.begin(&recording, &survey, &truth_m)?;
+        reporter.take_map(&survey, path, &map, &learned)?;
+    }
 
     let mut rows = BaselineRows::default();
     let comparison = MapComparison { dataset: &recording.name, survey: &survey, map: &map, truth_m: &truth_m };
@@ -220,7 +285,6 @@ fn on_map(args: &Args, path: &Path, recording: &Recording, progress: &Progress) 
             "note: no rows for {names}: a map holds features, not images; --survey names the recordings it is of"
         );
     } else if !compare_images.is_empty() {
-        let learned = open_surveys(args, path, &map)?;
         let views = read_views(&learned.iter().chain([&recording]).collect::<Vec<_>>(), args, false, progress)?;
         progress.begin("baselines", 1);
         comparison.add_views(&mut rows, &learned, &views);
@@ -283,7 +347,12 @@ pub fn open_map(path: &Path) -> anyhow::Result<FeatureMap> {
 }
 
 /// The paper's protocol on one recording.
-fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::Result<Evaluation> {
+fn protocol(
+    args: &Args,
+    recording: &Recording,
+    mut reporter: Option<&mut Reporter>,
+    progress: &Progress,
+) -> anyhow::Result<Evaluation> {
     let recipes: Vec<Recipe> = args
         .recipe
         .iter()
@@ -316,6 +385,9 @@ fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::
         grid_step_m: args.grid_step_m,
         baselines: &args.baselines,
     };
+    if let Some(reporter) = &mut reporter {
+        reporter.begin(recording, &plain, exact_m.as_ref().unwrap_or(&plain.positions_m()))?;
+    }
     let mut all = Evaluation::default();
     for case in cases(args, &plain)? {
         let (survey, views) = match (case.variant, &fixed) {
@@ -323,7 +395,15 @@ fn protocol(args: &Args, recording: &Recording, progress: &Progress) -> anyhow::
             (Variant::Fixed, None) => continue,
             _ => (&plain, &plain_views),
         };
-        let results = protocol.run(survey, &case, |part, step| progress.step(part, step)).map_err(bad_argument)?;
+        let mut seen = Ok(());
+        let on_trial = |trial: &Trial, outcomes: &Outcomes| {
+            if let (Some(reporter), Variant::Plain, Ok(())) = (&mut reporter, case.variant, &seen) {
+                seen = reporter.take_trial(survey, &case, trial, outcomes);
+            }
+        };
+        let on_step = |part: &str, step| progress.step(part, step);
+        let results = protocol.run(survey, &case, on_step, on_trial).map_err(bad_argument)?;
+        seen?;
         // What the fits have to say is said once, not for every seed and variant.
         let is_first = case.variant == Variant::Plain
             && case.split_name == args.split[0]

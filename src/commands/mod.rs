@@ -21,6 +21,11 @@ pub mod progress;
 pub mod record;
 pub mod recover;
 pub mod replay;
+#[cfg(feature = "report")]
+mod reporter;
+#[cfg(not(feature = "report"))]
+#[path = "no_reporter.rs"]
+mod reporter;
 pub mod simulate;
 pub mod survey;
 pub mod train;

@@ -7,7 +7,7 @@ use super::entry::Entry;
 use crate::features::Descriptor;
 use crate::map::{Grid, Recipe, Selection, Smoothing};
 use crate::metrics::ErrorFigures;
-use crate::train::{Outcome, Similarity, Split, Step, Survey, TrackSmoother, Trial, TrialError, noisy, run};
+use crate::train::{Outcome, Outcomes, Similarity, Split, Step, Survey, TrackSmoother, Trial, TrialError, noisy, run};
 use crate::types::PositionM;
 
 /// What is done to the frames of a random split before anything is learned.
@@ -74,7 +74,8 @@ impl Protocol<'_> {
         self.smoothing.unwrap_or(Smoothing::usual(recipe.name))
     }
 
-    /// Learns, selects and tests `case` on `survey`; `on_step` is told which part of the work takes a step.
+    /// Learns, selects and tests `case` on `survey`; `on_step` is told which part of the work takes a step, `on_trial` what
+    /// each recipe brought.
     ///
     /// # Errors
     /// A recipe cannot be learned from these frames.
@@ -83,6 +84,7 @@ impl Protocol<'_> {
         survey: &Survey,
         case: &Case,
         on_step: impl Fn(&str, Step) + Sync,
+        mut on_trial: impl FnMut(&Trial, &Outcomes),
     ) -> Result<CaseResults, TrialError> {
         let frames = CaseFrames::new(self, survey, case);
         let noisy_smoother = (case.variant == Variant::Noisy).then(|| TrackSmoother::new(survey, &frames.recorded_m));
@@ -113,6 +115,7 @@ impl Protocol<'_> {
                 remaining_std_m: &remaining_std_m,
             };
             let outcomes = run(survey, &trial, |step| on_step(&part, step))?;
+            on_trial(&trial, &outcomes);
             for outcome in &outcomes.rows {
                 for (warning, count) in &outcome.warnings {
                     let (features, of) = (&outcome.features, outcome.rank);

@@ -23,9 +23,9 @@ pub use panoramas::{DescribedRecording, describe_panoramas};
 pub use split::{BLOCKS, Split, SplitError};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
-pub use temperature::covers;
+pub use temperature::{covers, credible_level};
 pub use track::{Similarity, Smoothed, TrackSmoother};
-pub use trial::{Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
+pub use trial::{EliminationOnTest, Outcome, Outcomes, Step, Trial, TrialError, locate, noisy, run};
 pub use update::{BeforeAndAfter, UpdateError, UpdateReport, update};
 
 use crate::gp::LearningPositions;

@@ -56,10 +56,16 @@ pub fn covers(
     temperature: f64,
     probability: f64,
 ) -> bool {
+    credible_level(cells, log_likelihood, truth_m, temperature) < probability
+}
+
+/// The probability of all cells that are likelier than the one nearest `truth_m`: the smallest region that holds more than
+/// that holds `truth_m`. Uniform in 0..1 over frames where the probabilities are right.
+pub fn credible_level(cells: &CandidateCells, log_likelihood: &[f32], truth_m: PositionM, temperature: f64) -> f64 {
     let relative = relative_probabilities(log_likelihood, temperature);
     let at_truth = relative[nearest_cell(&cells.centers_m(), truth_m)];
     let likelier: f64 = relative.iter().filter(|&&p| p > at_truth).sum();
-    likelier < probability * relative.iter().sum::<f64>()
+    likelier / relative.iter().sum::<f64>()
 }
 
 /// −log of the mean probability of the cells `there`, by their weights, which sum to 1.

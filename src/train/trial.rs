@@ -11,7 +11,7 @@ use super::group::{LearnError, LearnedGroup};
 use super::perturbation::standard_normal;
 use super::recognition::{self, HeldBack};
 use super::split::Split;
-use super::subset::{LikelihoodTable, backward_elimination};
+use super::subset::{Elimination, LikelihoodTable, backward_elimination};
 use super::survey::Survey;
 use super::temperature::fit_temperature;
 use crate::gp::fit::Warning;
@@ -71,6 +71,16 @@ pub struct Outcome {
     pub bic_kept: Option<f64>,
     /// Fits with something to say, by what they say.
     pub warnings: BTreeMap<Warning, usize>,
+    /// How features were removed; `None` where they were not removed one by one.
+    pub elimination: Option<EliminationOnTest>,
+}
+
+/// A backward elimination, and what the test frames, which had no part in it, would have been answered on the way.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EliminationOnTest {
+    pub path: Elimination,
+    /// Estimates of the test frames with 0, 1, … features removed, by cells; with all removed the median.
+    pub test_m: Vec<Vec<PositionM>>,
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -187,10 +197,17 @@ fn run_once(
             || on_step(Step::FeatureFitted),
         )?;
         let field = group.on_cells(&learning, &centers_m)?;
+        let mut elimination = None;
         let kept = match trial.recipe.selection {
             Selection::None => (0..group.features()).collect(),
             Selection::Folded => folded_selection(&group, &learning, &cells, FOLD_SEED)?,
-            Selection::Backward => queries.select(&group, &field, &centers_m, on_step)?,
+            Selection::Backward => {
+                let path = queries.eliminate(&group, &field, &centers_m, on_step)?;
+                let kept = path.best_subset();
+                let test_m = queries.test_on_path(&path, &group, &field, &centers_m, median_m);
+                elimination = Some(EliminationOnTest { path, test_m });
+                kept
+            }
         };
         let kept_group = group.select(&kept);
         let kept_field = field.select(&kept);
@@ -210,6 +227,7 @@ fn run_once(
             bic_all: bic(&everything),
             bic_kept: bic(&kept),
             warnings: group.hyperparameters.warnings(),
+            elimination,
         });
         let weight = group_recipe.weight as f32;
         let of_group = queries.nowhere(&kept_group, &split.validation);
@@ -251,6 +269,7 @@ fn run_once(
             bic_all: sum(|outcome| outcome.bic_all),
             bic_kept: sum(|outcome| outcome.bic_kept),
             warnings: BTreeMap::new(),
+            elimination: None,
         });
     }
     Ok(Outcomes { rows: outcomes, groups, learned_from: learning.len(), temperature, least_resemblance })
@@ -277,13 +296,13 @@ struct Queries<'a> {
 
 impl Queries<'_> {
     /// Backward elimination on the validation frames.
-    fn select(
+    fn eliminate(
         &self,
         group: &LearnedGroup,
         field: &FieldOnCells,
         centers_m: &[PositionM],
         on_step: &(impl Fn(Step) + Sync),
-    ) -> Result<Vec<usize>, TrialError> {
+    ) -> Result<Elimination, TrialError> {
         on_step(Step::Eliminating { features: group.features() });
         let (features, queries, cells) = (group.features(), self.validation_m.len(), centers_m.len());
         let bytes = features * queries * cells * size_of::<f32>();
@@ -296,7 +315,36 @@ impl Queries<'_> {
         for (row, &truth_m) in rows.into_iter().zip(&self.validation_m) {
             table.push(truth_m, row);
         }
-        Ok(backward_elimination(&table, |_| on_step(Step::FeatureEliminated)).best_subset())
+        Ok(backward_elimination(&table, |_| on_step(Step::FeatureEliminated)))
+    }
+
+    /// Answers for the test frames on the way of an elimination: step × frame.
+    fn test_on_path(
+        &self,
+        path: &Elimination,
+        group: &LearnedGroup,
+        field: &FieldOnCells,
+        centers_m: &[PositionM],
+        median_m: PositionM,
+    ) -> Vec<Vec<PositionM>> {
+        let features = self.features(group, &self.trial.split.test);
+        let of_frames: Vec<Vec<PositionM>> = features
+            .par_iter()
+            .map(|features| {
+                let each = field.log_likelihood_of_each(features);
+                let row = |r: usize| &each[r * centers_m.len()..(r + 1) * centers_m.len()];
+                let mut sum = vec![0.0_f32; centers_m.len()];
+                (0..group.features()).for_each(|r| sum.iter_mut().zip(row(r)).for_each(|(sum, l)| *sum += l));
+                let mut answers_m = vec![centers_m[most_likely_cell(&sum)]];
+                for (step, &removed) in path.removed.iter().enumerate() {
+                    sum.iter_mut().zip(row(removed)).for_each(|(sum, l)| *sum -= l);
+                    let is_empty = step + 1 == path.removed.len();
+                    answers_m.push(if is_empty { median_m } else { centers_m[most_likely_cell(&sum)] });
+                }
+                answers_m
+            })
+            .collect();
+        (0..path.rmse_m.len()).map(|step| of_frames.iter().map(|answers_m| answers_m[step]).collect()).collect()
     }
 
     fn likelihoods(&self, group: &LearnedGroup, field: &FieldOnCells, rows: &[usize]) -> Likelihoods {

@@ -1,0 +1,266 @@
+//! The worst frames, with what explains them: the image, where it was and was thought to be, and what was learned there.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::{Value, json};
+
+use super::chart::color::{FAINT, GRID, INK, PAPER, VERMILION};
+use super::chart::map_plot::Extent;
+use super::chart::plot::NOTE;
+use super::chart::scale::meters;
+use super::chart::svg::{Paint, Shapes, document, escaped};
+use super::dataset::Dataset;
+use super::figures::extent_of;
+use super::methods::{FrameError, headline, methods};
+use super::photograph::Photograph;
+use crate::jpeg::JpegError;
+use crate::panorama::UnwrapTable;
+use crate::recording::{Recording, RecordingError};
+use crate::types::{CalibrationError, PositionM, distance_m};
+
+/// Frames that are shown.
+const WORST: usize = 6;
+
+/// A frame and why it may have gone wrong.
+#[derive(Debug, Clone)]
+pub struct Worst {
+    pub frame: FrameError,
+    pub photograph: Photograph,
+    /// The learning image nearest to where it was taken, and to where it was thought to be.
+    pub at_truth: Option<Neighbour>,
+    pub at_answer: Option<Neighbour>,
+}
+
+#[derive(Debug, Clone)]
+pub struct Neighbour {
+    pub recording: String,
+    pub index: usize,
+    pub position_m: PositionM,
+    pub photograph: Photograph,
+}
+
+/// What is shown, before any image is read.
+#[derive(Debug, Clone)]
+pub struct Chosen {
+    pub method: String,
+    pub frames: Vec<FrameError>,
+    /// Learning frames: recording and row, position.
+    learning: Vec<Vec<((usize, usize), PositionM)>>,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum GalleryError {
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    #[error(transparent)]
+    Calibration(#[from] CalibrationError),
+    #[error("frame {index}")]
+    Frame { index: usize, source: JpegError },
+}
+
+/// The worst frames of the headline method, each once. `surveys` are what a map was learned from.
+pub fn choose(dataset: &Dataset, surveys: &[Recording]) -> Option<Chosen> {
+    let split = dataset.split_names().into_iter().next();
+    let all = methods(dataset, split.as_deref());
+    let method = headline(&all)?;
+    let mut errors = method.errors();
+    errors.sort_by(|a, b| b.error_m.total_cmp(&a.error_m).then(a.index.cmp(&b.index)));
+    let mut seen = BTreeSet::new();
+    errors.retain(|frame| seen.insert(frame.index));
+    errors.truncate(WORST);
+    let learning_of = |frame: &FrameError| -> Vec<((usize, usize), PositionM)> {
+        if dataset.map.is_some() {
+            let of = surveys.iter().enumerate();
+            return of
+                .flat_map(|(i, recording)| {
+                    recording.survey.iter().enumerate().map(move |(row, f)| ((i, row), f.position_m))
+                })
+                .collect();
+        }
+        let shown = dataset.splits.iter().find(|shown| Some(&shown.name) == split.as_ref() && shown.seed == frame.seed);
+        let Some(shown) = shown else { return Vec::new() };
+        let entry = method.entries.iter().find(|entry| entry.seed == frame.seed);
+        let refits = entry.is_some_and(|entry| entry.n_learned_from > entry.n_learning);
+        let validation = if refits { &shown.split.validation[..] } else { &[] };
+        let rows = shown.split.learning.iter().chain(validation);
+        rows.map(|&row| ((0, row), dataset.frames[row].position_m)).collect()
+    };
+    let learning = errors.iter().map(learning_of).collect();
+    Some(Chosen { method: method.label.clone(), frames: errors, learning })
+}
+
+/// Reads the images of what was chosen, and of the frame at `shown_row`.
+pub fn read(
+    chosen: &Chosen,
+    dataset: &Dataset,
+    recording: &Recording,
+    surveys: &[Recording],
+) -> Result<Vec<Worst>, GalleryError> {
+    let row_of = |index: usize| dataset.frames.iter().position(|frame| frame.index == index);
+    let nearest = |i: usize, to: PositionM| {
+        let of = chosen.learning[i].iter();
+        of.min_by(|a, b| distance_m(a.1, to).total_cmp(&distance_m(b.1, to))).map(|(place, _)| *place)
+    };
+    let sources: Vec<&Recording> = if dataset.map.is_some() { surveys.iter().collect() } else { vec![recording] };
+    let mut wanted: Vec<BTreeSet<usize>> = vec![BTreeSet::new(); sources.len()];
+    let neighbours: Vec<[Option<(usize, usize)>; 2]> = chosen
+        .frames
+        .iter()
+        .enumerate()
+        .map(|(i, frame)| [nearest(i, frame.truth_m), nearest(i, frame.estimate_m)])
+        .collect();
+    for (source, row) in neighbours.iter().flatten().flatten() {
+        wanted[*source].insert(*row);
+    }
+    let own: BTreeSet<usize> = chosen.frames.iter().filter_map(|frame| row_of(frame.index)).collect();
+    let own = photographs(recording, &own)?;
+    let mut learned = Vec::new();
+    for (source, rows) in sources.iter().zip(&wanted) {
+        learned.push(photographs(source, rows)?);
+    }
+    let neighbour = |place: Option<(usize, usize)>| {
+        let (source, row) = place?;
+        let frame = &sources[source].survey[row];
+        let (index, position_m) = (frame.index, frame.position_m);
+        let photograph = learned[source].get(&row)?.clone();
+        Some(Neighbour { recording: sources[source].name.clone(), index, position_m, photograph })
+    };
+    let worst = chosen.frames.iter().zip(&neighbours).filter_map(|(frame, [at_truth, at_answer])| {
+        let photograph = own.get(&row_of(frame.index)?)?.clone();
+        Some(Worst { frame: *frame, photograph, at_truth: neighbour(*at_truth), at_answer: neighbour(*at_answer) })
+    });
+    Ok(worst.collect())
+}
+
+/// Photographs of the frames at `rows`.
+pub fn photographs(recording: &Recording, rows: &BTreeSet<usize>) -> Result<BTreeMap<usize, Photograph>, GalleryError> {
+    let mut found = BTreeMap::new();
+    let Some(&last) = rows.last() else { return Ok(found) };
+    let donut = recording.calibration()?;
+    let mut table: Option<UnwrapTable> = None;
+    for (row, frame) in recording.frames()?.enumerate().take(last + 1) {
+        let (frame, jpeg) = frame?;
+        if !rows.contains(&row) {
+            continue;
+        }
+        let table = match &table {
+            Some(table) => table,
+            None => {
+                let mut decoder = crate::jpeg::LumaDecoder::new();
+                let image =
+                    decoder.decode(&jpeg).map_err(|source| GalleryError::Frame { index: frame.index, source })?;
+                table.insert(UnwrapTable::build(&donut, image.width_px, image.height_px)?)
+            }
+        };
+        let photograph = Photograph::of(&jpeg, &donut, table, frame.yaw_rad);
+        found.insert(row, photograph.map_err(|source| GalleryError::Frame { index: frame.index, source })?);
+    }
+    Ok(found)
+}
+
+/// The gallery as HTML.
+pub fn html(dataset: &Dataset, chosen: &Chosen, worst: &[Worst]) -> String {
+    let mut html = format!(
+        "<p>The largest errors of <b>{}</b>, each frame once. Panoramas begin to the east where the yaw is known, so that \
+         those of one place look alike.</p><div class=\"gallery\">",
+        escaped(&chosen.method)
+    );
+    for one in worst {
+        let seed = one.frame.seed.map(|seed| format!(", seed {seed}")).unwrap_or_default();
+        html += &format!(
+            "<article class=\"worst\"><h4>Frame {}{seed}: {} m off</h4><div class=\"pair\">\
+             <img src=\"{}\" alt=\"camera image of frame {}\" width=\"320\" height=\"320\">{}</div>{}",
+            one.frame.index,
+            meters(one.frame.error_m),
+            one.photograph.donut,
+            one.frame.index,
+            small_map(dataset, &one.frame),
+            panorama("this frame", &one.photograph)
+        );
+        match &one.at_truth {
+            Some(near) => {
+                let apart_m = distance_m(near.position_m, one.frame.truth_m);
+                html += &panorama(
+                    &format!("nearest learning image, {} m from the truth ({})", meters(apart_m), near.name()),
+                    &near.photograph,
+                );
+            }
+            None if dataset.map.is_some() => {
+                html += "<p class=\"note\">A map holds no images: name the recordings it was learned from with --survey to see \
+                         the nearest one.</p>";
+            }
+            None => {}
+        }
+        if let Some(near) = &one.at_answer
+            && one.at_truth.as_ref().is_none_or(|other| other.index != near.index)
+        {
+            let apart_m = distance_m(near.position_m, one.frame.estimate_m);
+            html += &panorama(
+                &format!("learning image at the answer, {} m from it ({})", meters(apart_m), near.name()),
+                &near.photograph,
+            );
+        }
+        html += "</article>";
+    }
+    html + "</div>"
+}
+
+impl Neighbour {
+    fn name(&self) -> String {
+        format!("{} of {}", self.index, self.recording)
+    }
+}
+
+fn panorama(what: &str, photograph: &Photograph) -> String {
+    format!(
+        "<figure class=\"strip\"><img src=\"{}\" alt=\"panorama: {what}\" width=\"512\" height=\"128\"><figcaption>{what}\
+         </figcaption></figure>",
+        photograph.panorama,
+        what = escaped(what)
+    )
+}
+
+/// Where it was and where it was thought to be, with a bar for scale in place of axes.
+fn small_map(dataset: &Dataset, frame: &FrameError) -> String {
+    const SIDE_PX: f64 = 240.0;
+    const BELOW_PX: f64 = 24.0;
+    let Extent { low_m, high_m } = extent_of(dataset);
+    let scale = SIDE_PX / (high_m[0] - low_m[0]).max(high_m[1] - low_m[1]);
+    let size = [(high_m[0] - low_m[0]) * scale, (high_m[1] - low_m[1]) * scale];
+    let at = |[e, n]: PositionM| [(e - low_m[0]) * scale, (high_m[1] - n) * scale];
+    let mut shapes = Shapes::default();
+    shapes.rect([0.0, 0.0], size, Paint::fill(PAPER).outlined(GRID, 1.0));
+    let learned = dataset.insights.first().map(|insight| &insight.learning_m[..]).unwrap_or_default();
+    learned.iter().for_each(|&position_m| shapes.circle(at(position_m), 1.2, Paint::fill(FAINT)));
+    let (truth, estimate) = (at(frame.truth_m), at(frame.estimate_m));
+    shapes.line(truth, estimate, Paint::stroke(VERMILION, 1.6));
+    shapes.circle(truth, 5.0, Paint::fill(PAPER).outlined(INK, 2.0));
+    shapes.diamond(estimate, 6.0, Paint::fill(VERMILION).outlined(PAPER, 1.0));
+    let bar_m = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0]
+        .into_iter()
+        .rfind(|bar_m| bar_m * scale < 0.4 * size[0])
+        .unwrap_or(0.1);
+    let y = size[1] + 12.0;
+    shapes.line([0.0, y], [bar_m * scale, y], Paint::stroke(INK, 2.0));
+    shapes.text([bar_m * scale + 6.0, y + 4.0], &format!("{bar_m} m"), NOTE);
+    let label = format!("truth (ring) and estimate (diamond) of frame {}", frame.index);
+    document([size[0] + 1.0, size[1] + BELOW_PX], &shapes, &label)
+}
+
+pub fn json(chosen: &Chosen, worst: &[Worst]) -> Value {
+    let near = |neighbour: &Option<Neighbour>| {
+        neighbour.as_ref().map(|n| json!({"recording": n.recording, "index": n.index, "position_m": n.position_m}))
+    };
+    let frames = worst.iter().map(|one| {
+        json!({
+            "index": one.frame.index,
+            "seed": one.frame.seed,
+            "truth_m": one.frame.truth_m,
+            "estimate_m": one.frame.estimate_m,
+            "error_m": one.frame.error_m,
+            "nearest_learning_image": near(&one.at_truth),
+            "learning_image_at_the_answer": near(&one.at_answer),
+        })
+    });
+    json!({"method": chosen.method, "frames": frames.collect::<Vec<_>>()})
+}

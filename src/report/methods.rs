@@ -1,0 +1,243 @@
+//! The methods that are compared: their names, their colours, and their errors over all seeds.
+
+use super::chart::color::{BLACK, BLUE, GREEN, MUTED, ORANGE, PURPLE, SKY, VERMILION};
+use super::dataset::Dataset;
+use crate::evaluate::statistics::{Comparison, MethodStatistics, Statistics};
+use crate::evaluate::{Entry, FrameEntry};
+use crate::features::Descriptor;
+use crate::types::PositionM;
+
+/// All plain results of one method on one split.
+#[derive(Debug, Clone)]
+pub struct Method<'a> {
+    pub label: String,
+    pub color: &'static str,
+    pub dashes: Option<&'static str>,
+    pub kind: Kind,
+    /// One a seed.
+    pub entries: Vec<&'a Entry>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// A recipe with everything it has, or an estimator that takes a whole drive.
+    Whole,
+    /// One type of features of a recipe.
+    Part,
+    /// Something simpler.
+    Baseline,
+    /// Always the same answer.
+    Nothing,
+}
+
+/// One frame's error.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameError {
+    pub index: usize,
+    pub seed: Option<u64>,
+    pub truth_m: PositionM,
+    pub estimate_m: PositionM,
+    pub error_m: f64,
+}
+
+impl<'a> Method<'a> {
+    /// The method of an entry, without its entries.
+    fn of(entry: &Entry) -> Self {
+        let features = entry.features.as_str();
+        let is_baseline = entry.recipe.is_none();
+        let is_sequence = entry.estimator != "single";
+        let (label, color, dashes, kind) = match (entry.recipe, features) {
+            (_, "filtered") => ("filtered".to_owned(), GREEN, None, Kind::Whole),
+            (_, "smoothed") => ("smoothed".to_owned(), PURPLE, None, Kind::Whole),
+            (_, "median") => ("always the median".to_owned(), MUTED, Some("2 3"), Kind::Nothing),
+            (Some(recipe), "fused") => {
+                let color = if recipe == "paper" { VERMILION } else { BLUE };
+                (format!("{}, all features", recipe_name(recipe)), color, None, Kind::Whole)
+            }
+            (Some(recipe), of_type) => {
+                let color = if recipe == "paper" { ORANGE } else { SKY };
+                (format!("{}, {}", recipe_name(recipe), feature_name(of_type)), color, type_dashes(of_type), Kind::Part)
+            }
+            (None, baseline) => {
+                let (name, color, dashes) = baseline_name(baseline);
+                (name, color, dashes, Kind::Baseline)
+            }
+        };
+        let kind = if is_sequence { Kind::Whole } else { kind };
+        let kind = if is_baseline && kind == Kind::Part { Kind::Baseline } else { kind };
+        Self { label, color, dashes, kind, entries: Vec::new() }
+    }
+
+    /// What an entry's method is called.
+    pub fn name_of(entry: &Entry) -> String {
+        Method::of(entry).label
+    }
+
+    /// Errors of all frames that have an estimate, seed after seed.
+    pub fn errors(&self) -> Vec<FrameError> {
+        let of_entry = |entry: &&'a Entry| {
+            let frames = entry.frames.iter().flatten();
+            let seed = entry.seed;
+            frames.filter_map(move |frame| frame_error(frame, seed)).collect::<Vec<_>>()
+        };
+        self.entries.iter().flat_map(of_entry).collect()
+    }
+
+    /// Error \[m\] of every frame that has one, in rising order.
+    pub fn sorted_errors_m(&self) -> Vec<f64> {
+        let mut errors_m: Vec<f64> = self.errors().iter().map(|frame| frame.error_m).collect();
+        errors_m.sort_unstable_by(f64::total_cmp);
+        errors_m
+    }
+
+    /// What bootstrap draws say of it.
+    pub fn statistics<'b>(&self, of: &'b Statistics) -> Option<&'b MethodStatistics> {
+        let first = self.entries[0];
+        of.methods.iter().find(|method| {
+            let (section, found) = (&method.section, &method.method);
+            section.split == first.split
+                && (section.noisy, section.fixed) == (first.noisy, first.fixed)
+                && (found.recipe, &found.features, found.estimator) == (first.recipe, &first.features, first.estimator)
+        })
+    }
+
+    /// How it compares with the method that its table is about.
+    pub fn comparison<'b>(&self, of: &'b Statistics) -> Option<&'b Comparison> {
+        let first = self.entries[0];
+        of.comparisons.iter().find(|comparison| {
+            let (section, found) = (&comparison.section, &comparison.method);
+            section.split == first.split
+                && (section.noisy, section.fixed) == (first.noisy, first.fixed)
+                && (found.recipe, &found.features, found.estimator) == (first.recipe, &first.features, first.estimator)
+        })
+    }
+
+    /// Mean over the seeds.
+    pub fn mean(&self, of: impl Fn(&Entry) -> Option<f64>) -> Option<f64> {
+        let values: Option<Vec<f64>> = self.entries.iter().map(|entry| of(entry)).collect();
+        values.filter(|values| !values.is_empty()).map(|values| values.iter().sum::<f64>() / values.len() as f64)
+    }
+}
+
+fn frame_error(frame: &FrameEntry, seed: Option<u64>) -> Option<FrameError> {
+    let (truth_m, estimate_m) = ([frame.truth_e_m, frame.truth_n_m], [frame.est_e_m?, frame.est_n_m?]);
+    let error_m = crate::types::distance_m(truth_m, estimate_m);
+    Some(FrameError { index: frame.index, seed, truth_m, estimate_m, error_m })
+}
+
+/// The plain methods of a split (`None`: against a map), those that matter most first.
+pub fn methods<'a>(dataset: &'a Dataset, split: Option<&str>) -> Vec<Method<'a>> {
+    let mut methods: Vec<Method> = Vec::new();
+    for entry in &dataset.entries {
+        if entry.split.as_deref() != split || entry.noisy || entry.fixed {
+            continue;
+        }
+        let same = |method: &&mut Method| method.entries[0].row_key() == entry.row_key();
+        match methods.iter_mut().find(same) {
+            Some(method) => method.entries.push(entry),
+            None => methods.push(Method { entries: vec![entry], ..Method::of(entry) }),
+        }
+    }
+    // A recipe of one type of features stands for itself.
+    for recipe in ["default", "paper"] {
+        let of_recipe =
+            |method: &&mut Method| method.entries[0].recipe == Some(recipe) && method.entries[0].estimator == "single";
+        let mut own: Vec<&mut Method> = methods.iter_mut().filter(of_recipe).collect();
+        if let [only] = &mut own[..] {
+            only.kind = Kind::Whole;
+            only.dashes = None;
+            only.color = if recipe == "paper" { VERMILION } else { BLUE };
+        }
+    }
+    methods.sort_by_key(|method| (method.kind, method.entries[0].recipe != Some("default")));
+    methods
+}
+
+/// The method that a report is about: what `localize` would say, frame by frame.
+pub fn headline<'a, 'b>(methods: &'b [Method<'a>]) -> Option<&'b Method<'a>> {
+    let whole = |method: &&Method| method.kind == Kind::Whole && method.entries[0].estimator == "single";
+    methods
+        .iter()
+        .find(|method| whole(method) && method.entries[0].recipe == Some("default"))
+        .or_else(|| methods.iter().find(whole))
+}
+
+/// A recipe in words.
+pub fn recipe_name(recipe: &str) -> &str {
+    match recipe {
+        "paper" => "paper’s recipe",
+        "default" => "default recipe",
+        other => other,
+    }
+}
+
+/// A feature type in words.
+pub fn feature_name(name: &str) -> String {
+    match name {
+        "fft" => "FFT",
+        "hist" => "histogram",
+        "hist-sqrt" => "histogram (√)",
+        "sp" => "steerable pyramid",
+        "sp-log" => "steerable pyramid (log)",
+        "sp-energy" => "steerable pyramid (energy)",
+        "gradient" => "gradients",
+        "gradient-unsigned" => "gradients, unsigned",
+        "gradient-coarse" => "gradients, coarse",
+        "patch-words" => "patch words",
+        "fused" => "all features",
+        other => other,
+    }
+    .into()
+}
+
+fn type_dashes(name: &str) -> Option<&'static str> {
+    match name.parse() {
+        Ok(Descriptor::Fft | Descriptor::Gradient) => None,
+        Ok(Descriptor::Hist | Descriptor::GradientUnsigned) => Some("6 3"),
+        Ok(Descriptor::Sp | Descriptor::GradientCoarse) => Some("2 2"),
+        Ok(Descriptor::Patches) => Some("8 3 2 3"),
+        _ => Some("1 3"),
+    }
+}
+
+fn baseline_name(name: &str) -> (String, &'static str, Option<&'static str>) {
+    match name {
+        "bow" => ("bag of words, paper’s rule".into(), BLACK, Some("6 3")),
+        "bow-nearest" => ("bag of words, nearest image".into(), BLACK, None),
+        "bow-surf" => ("bag of words, SURF".into(), BLACK, Some("2 2")),
+        "bow-surf-nearest" => ("bag of words, SURF, nearest image".into(), BLACK, Some("8 3 2 3")),
+        "nearest" => ("nearest image by features".into(), GREEN, Some("6 3")),
+        "aligned" => ("nearest image, aligned".into(), PURPLE, Some("6 3")),
+        other => (other.into(), GREEN, Some("2 2")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_result_has_a_name_and_its_place() {
+        let entry = |recipe, features: &str| Entry {
+            recipe,
+            features: features.into(),
+            estimator: "single",
+            ..Entry::default()
+        };
+        let of = |entry: &Entry| {
+            let method = Method::of(entry);
+            (method.label, method.kind)
+        };
+        for (recipe, features, label, kind) in [
+            (Some("paper"), "fused", "paper’s recipe, all features", Kind::Whole),
+            (Some("paper"), "sp", "paper’s recipe, steerable pyramid", Kind::Part),
+            (None, "bow", "bag of words, paper’s rule", Kind::Baseline),
+            (None, "something new", "something new", Kind::Baseline),
+            (None, "median", "always the median", Kind::Nothing),
+        ] {
+            assert_eq!(of(&entry(recipe, features)), (label.into(), kind));
+        }
+        let sequence = Entry { estimator: "filtered", ..entry(Some("default"), "filtered") };
+        assert_eq!(of(&sequence), ("filtered".into(), Kind::Whole));
+    }
+}

@@ -1,0 +1,250 @@
+//! `evaluate --report` as a whole: its files, that every number on the page is in the JSON, and that a browser shows it.
+
+mod common;
+
+use std::{
+    collections::BTreeSet,
+    fs,
+    path::{Path, PathBuf},
+    sync::OnceLock,
+};
+
+use common::{TinyDataset, names, omniloc, run};
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// A name that wants to be more than text.
+const HOSTILE: &str = "yard <script>alert(1)</script> & \"quotes\"";
+
+/// A report of the protocol, on the sample's first photographs under a hostile name, and the folder it lies in.
+fn protocol_report() -> PathBuf {
+    static FOLDER: OnceLock<TempDir> = OnceLock::new();
+    let folder = FOLDER.get_or_init(|| {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let recording = courtyard(folder.path(), 40);
+        let report = folder.path().join("report");
+        let (code, stdout, stderr) = run(omniloc()
+            .arg("evaluate")
+            .arg(&recording)
+            .args(["--features", "sp", "--seeds", "2", "--variants", "plain,noisy", "--grid-step-m", "5", "--report"])
+            .arg(&report));
+        assert_eq!(code, 0, "{stderr}");
+        assert!(stdout.contains("report/index.html") && stderr.contains("report: drawing"), "{stdout}{stderr}");
+        folder
+    });
+    folder.path().join("report")
+}
+
+/// A report of another drive through the simulated corridor against its map.
+fn map_report() -> PathBuf {
+    static FOLDER: OnceLock<TempDir> = OnceLock::new();
+    let folder = FOLDER.get_or_init(|| {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let (dataset, recording) = (folder.path().join("evening"), folder.path().join("evening.mcap"));
+        let place =
+            ["--world", "corridor", "--seed", common::map::SEED, "--day", "2", "--frames", "60", "--size", "320x180"];
+        omniloc().arg("simulate").args(place).arg("--out").arg(&dataset).assert().success();
+        omniloc().arg("import").arg(&dataset).arg("--out").arg(&recording).assert().success();
+        let report = folder.path().join("report");
+        let (code, _, stderr) = run(omniloc()
+            .arg("evaluate")
+            .arg(&recording)
+            .arg("--map")
+            .arg(common::map::map())
+            .arg("--survey")
+            .arg(common::map::folder().join("survey.mcap"))
+            .arg("--report")
+            .arg(&report));
+        assert_eq!(code, 0, "{stderr}");
+        folder
+    });
+    folder.path().join("report")
+}
+
+/// A recording of the sample's first `frames` photographs.
+fn courtyard(folder: &Path, frames: usize) -> PathBuf {
+    let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/courtyard-75");
+    // A folder's name cannot have a slash.
+    let dataset = folder.join(HOSTILE.replace('/', "\u{2215}"));
+    fs::create_dir_all(dataset.join("images")).expect("a folder");
+    let rows = fs::read_to_string(sample.join("positions.csv")).expect("the sample is shipped");
+    let kept: Vec<&str> = rows.lines().take(1 + frames).collect();
+    fs::write(dataset.join("positions.csv"), kept.join("\n") + "\n").expect("writes");
+    for index in 0..frames {
+        let name = format!("images/{index:04}.jpg");
+        fs::copy(sample.join(&name), dataset.join(&name)).expect("copies");
+    }
+    fs::copy(sample.join("donut.json"), dataset.join("donut.json")).expect("copies");
+    let out = folder.join("courtyard.mcap");
+    omniloc().arg("import").arg(&dataset).arg("--out").arg(&out).assert().success();
+    out
+}
+
+fn page(report: &Path) -> String {
+    fs::read_to_string(report.join("index.html")).expect("the page is written")
+}
+
+fn json(report: &Path) -> Value {
+    serde_json::from_slice(&fs::read(report.join("report.json")).expect("the JSON is written")).expect("JSON")
+}
+
+/// The value at `a.b.3.c`.
+fn at<'a>(value: &'a Value, path: &str) -> Option<&'a Value> {
+    path.split('.').try_fold(value, |value, key| match value {
+        Value::Array(list) => list.get(key.parse::<usize>().ok()?),
+        object => object.get(key),
+    })
+}
+
+/// The pieces of `text` between `before` and `after`.
+fn between<'a>(text: &'a str, before: &str, after: &str) -> Vec<&'a str> {
+    text.split(before).skip(1).filter_map(|rest| rest.split(after).next()).collect()
+}
+
+#[test]
+fn a_report_is_a_page_with_its_figures_and_all_their_numbers() {
+    for (report, expected, left_out) in [
+        (protocol_report(), &["comparison", "elimination", "tiles", "reliability"][..], "The drive, second by second"),
+        (map_report(), &["timeline", "estimates", "error-map", "likelihood", "surfaces"], "Backward elimination"),
+    ] {
+        let (page, json) = (page(&report), json(&report));
+        assert_eq!(names(&report), ["figures", "index.html", "report.json"]);
+        let figures = json["figures"].as_object().expect("figures by name");
+        for kind in expected {
+            assert!(figures.keys().any(|id| id.ends_with(&format!("-{kind}"))), "{kind} in {:?}", figures.keys());
+        }
+        let left: Vec<_> = json["left_out"].as_array().expect("a list").iter().map(|one| &one["title"]).collect();
+        assert!(left.iter().any(|title| *title == left_out), "{left:?}");
+        assert!(page.contains(&format!("<b>{left_out}:</b> left out.")));
+
+        let shown: BTreeSet<&str> = between(&page, "data-source=\"figures.", ".data\"").into_iter().collect();
+        assert_eq!(shown, figures.keys().map(String::as_str).collect(), "figures on the page and in the JSON");
+        let files: BTreeSet<String> = names(&report.join("figures")).into_iter().collect();
+        let written = figures.keys().flat_map(|id| [format!("{id}.svg"), format!("{id}.png")]);
+        assert_eq!(files, written.collect());
+        for (id, figure) in figures {
+            assert!(!figure["data"].is_null() && figure["data"] != Value::Array(Vec::new()), "{id} has no data");
+            let svg = fs::read_to_string(report.join(format!("figures/{id}.svg"))).expect("readable");
+            assert!(svg.starts_with("<svg xmlns") && svg.ends_with("</svg>"), "{id}");
+            let png = image::open(report.join(format!("figures/{id}.png"))).expect("a picture").to_luma8();
+            let dark = png.pixels().filter(|pixel| pixel[0] < 128).count();
+            assert!(png.width() > 400 && dark > 300, "{id}: {dark} dark pixels of {:?}", png.dimensions());
+        }
+    }
+}
+
+#[test]
+fn every_table_cell_is_the_number_in_the_json() {
+    for report in [protocol_report(), map_report()] {
+        let (page, json) = (page(&report), json(&report));
+        let cells = between(&page, "<td data-source=\"", "</td>");
+        assert!(cells.len() > 40, "{} cells", cells.len());
+        for cell in cells {
+            let (path, text) = cell.split_once("\">").expect("a cell");
+            let value = at(&json, path).unwrap_or_else(|| panic!("{path} is not in the JSON"));
+            let Some(value) = value.as_f64() else {
+                assert!(value.is_null() && text == "–", "{path}: {value} is written {text}");
+                continue;
+            };
+            let plain = text.replace('−', "-").replace(['\u{a0}', '%', ' '], "");
+            let plain = plain.split('(').next().unwrap_or_default();
+            let shown: f64 = plain.parse().unwrap_or_else(|_| panic!("{path}: {text}"));
+            let shown = if text.contains('%') { shown / 100.0 } else { shown };
+            let decimals = plain.split_once('.').map_or(0, |(_, digits)| digits.len()) as i32;
+            let half_a_digit = 0.501 * 10.0_f64.powi(-decimals) * if text.contains('%') { 0.01 } else { 1.0 };
+            assert!((shown - value).abs() <= half_a_digit, "{path}: {value} is written {text}");
+        }
+    }
+}
+
+#[test]
+fn what_is_drawn_is_what_the_results_say() {
+    let json = json(&map_report());
+    let dataset = &json["datasets"][0];
+    let fused = dataset["results"].as_array().expect("a list").iter().find(|entry| entry["features"] == "fused");
+    let frames = fused.expect("a fused row")["frames"].as_array().expect("frames");
+    let panels = json["figures"]["evening-estimates"]["data"].as_array().expect("panels");
+    let drawn = panels[0]["frames"].as_array().expect("frames");
+    assert_eq!((frames.len(), drawn.len()), (60, 60));
+    for (result, drawn) in frames.iter().zip(drawn) {
+        let number = |value: &Value| value.as_f64().expect("a number");
+        assert_eq!(result["index"], drawn["index"]);
+        for (key, axis) in [("est_e_m", 0), ("est_n_m", 1)] {
+            assert!((number(&result[key]) - number(&drawn["estimate_m"][axis])).abs() < 1e-9, "{result} {drawn}");
+        }
+    }
+    // Each frame is one dot on the map.
+    let svg = fs::read_to_string(map_report().join("figures/evening-error-map.svg")).expect("readable");
+    assert_eq!(svg.matches("<title>frame ").count(), panels_frames(&json["figures"]["evening-error-map"]["data"]));
+    assert!(json["program"] == env!("CARGO_PKG_VERSION") && json["command"].as_array().expect("a list").len() > 5);
+    let facts = &dataset["facts"];
+    assert_eq!(facts["SHA-256"].as_str().expect("a text").len(), 64);
+    assert_eq!(dataset["map"]["info"]["recordings"][0]["frames"], 120);
+}
+
+fn panels_frames(panels: &Value) -> usize {
+    panels.as_array().expect("panels").iter().map(|panel| panel["frames"].as_array().expect("frames").len()).sum()
+}
+
+#[test]
+fn the_page_fetches_nothing_and_believes_no_name() {
+    for report in [protocol_report(), map_report()] {
+        let page = page(&report);
+        for address in between(&page, "src=\"", "\"").into_iter().chain(between(&page, "url(", ")")) {
+            assert!(address.starts_with("data:"), "{address:.80}");
+        }
+        for address in between(&page, " href=\"", "\"") {
+            let is_own = ["data:", "#", "figures/", "report.json"].iter().any(|own| address.starts_with(own));
+            assert!(is_own, "{address:.80}");
+        }
+        assert!(!page.contains("<script") && !page.contains("onload"));
+        assert!(page.contains("default-src 'none'"));
+    }
+    let hostile = page(&protocol_report());
+    assert!(hostile.contains("yard &lt;script&gt;alert(1)&lt;\u{2215}script&gt; &amp; &quot;quotes&quot;"));
+}
+
+#[test]
+fn a_report_replaces_only_a_report_and_only_when_told() {
+    let dataset = TinyDataset::new();
+    let recording = dataset.import("rec.mcap");
+    let folder = dataset.path("papers");
+    fs::create_dir_all(&folder).expect("a folder");
+    fs::write(folder.join("thesis.tex"), "years of work").expect("writes");
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--report").arg(&folder).arg("--force"));
+    assert!(code == 2 && stderr.contains("thesis.tex"), "{code} {stderr}");
+    let before = fs::read(protocol_report().join("index.html")).expect("readable");
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--report").arg(protocol_report()));
+    assert!(code == 2 && stderr.contains("--force"), "{code} {stderr}");
+    assert!(fs::read(protocol_report().join("index.html")).expect("readable") == before);
+}
+
+/// A program of Debian's chromium package.
+fn chromium() -> &'static str {
+    let known = ["/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"];
+    let found = known.into_iter().find(|path| Path::new(path).exists());
+    found.unwrap_or_else(|| panic!("chromium is not installed: tests/run does it, or apt-get install chromium"))
+}
+
+#[test]
+fn a_browser_shows_it_without_complaint_on_a_desk_and_on_a_telephone() {
+    let python = std::env::var("OMNILOC_PYTHON").unwrap_or_else(|_| "python3".into());
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/look_at_page.py");
+    for report in [protocol_report(), map_report()] {
+        let mut command = std::process::Command::new(&python);
+        command.arg(&script).arg(chromium()).arg(report.join("index.html")).arg("1280,390");
+        let outcome = command.output().expect("Python runs");
+        let stdout = String::from_utf8_lossy(&outcome.stdout);
+        assert!(outcome.status.success(), "{stdout}{}", String::from_utf8_lossy(&outcome.stderr));
+        let widths: Vec<Value> = stdout.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+        assert_eq!(widths.len(), 2, "{stdout}");
+        for found in widths {
+            let none = |key: &str| found[key].as_array().expect("a list").is_empty();
+            assert!(none("complaints") && none("requests") && none("sticking") && none("lost"), "{found}");
+            assert_eq!((&found["wide"], &found["broken"]), (&Value::from(0), &Value::from(0)), "{found}");
+            assert!(found["pictures"].as_u64() >= Some(10) && found["figures"].as_u64() >= Some(8), "{found}");
+            // Nine pixels are what small print in a newspaper is.
+            assert!(found["smallest_px"].as_f64() >= Some(9.0) && found["font"] == true, "{found}");
+        }
+    }
+}
