@@ -143,7 +143,7 @@ impl Grid {
     pub fn usual_step_m(positions: &[PositionM]) -> f64 {
         const ROOM_M: f64 = 20.0;
         let extent_m = crate::gp::fit::extent_m(positions);
-        if extent_m[0].hypot(extent_m[1]) < ROOM_M { 0.1 } else { 1.0 }
+        if libm::hypot(extent_m[0], extent_m[1]) < ROOM_M { 0.1 } else { 1.0 }
     }
 
     /// A grid that training could have made.
