@@ -81,7 +81,7 @@ pub struct Args {
     pub smooth: Option<Smoothing>,
     /// What to compare with, separated by commas: none; nearest, the nearest learning image by z-scored properties;
     /// aligned, the nearest by circular correlation of small panoramas; bow, a bag of words of upright patches, by the
-    /// paper's protocol and as nearest image [default: nearest,aligned,bow]
+    /// paper's protocol and as nearest image; bow-surf, the same of SURF, in builds with that [default: nearest,aligned,bow]
     #[arg(
         long,
         value_enum,
@@ -127,6 +127,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
     for baseline in &args.baselines {
         let refused = |reason: &str| BadArgument(format!("--baselines {}: {reason}", baseline.name()));
+        baseline.check().map_err(refused)?;
         if *baseline == Baseline::None && args.baselines.len() > 1 {
             return Err(refused("goes with no other").into());
         }

@@ -12,6 +12,8 @@ pub mod bag_of_words;
 mod codebook;
 pub mod nearest;
 mod rows;
+#[cfg(feature = "surf")]
+pub mod surf;
 mod views;
 
 pub use bag_of_words::{AssignedFrame, AssignedTest, WordAssignment};
@@ -29,6 +31,8 @@ pub enum Baseline {
     Aligned,
     /// Bag of words of upright patches: the paper's protocol, and the nearest learning image
     Bow,
+    /// Bag of words of SURF
+    BowSurf,
 }
 
 impl Baseline {
@@ -39,11 +43,22 @@ impl Baseline {
             Self::Nearest => "nearest",
             Self::Aligned => "aligned",
             Self::Bow => "bow",
+            Self::BowSurf => "bow-surf",
         }
     }
 
     /// Whether it needs the images that are learned from, which a map does not hold.
     pub fn compares_images(self) -> bool {
-        matches!(self, Self::Aligned | Self::Bow)
+        matches!(self, Self::Aligned | Self::Bow | Self::BowSurf)
+    }
+
+    /// Whether this build has it, or why not.
+    pub fn check(self) -> Result<(), &'static str> {
+        match self {
+            Self::BowSurf if cfg!(not(feature = "surf")) => Err(
+                "this build has no SURF, which may be patented: see CONTRIBUTING.md, then build with --features surf",
+            ),
+            _ => Ok(()),
+        }
     }
 }

@@ -80,7 +80,7 @@ impl BaselineRows {
             let entry = Entry { features: "aligned".into(), ..base.clone() };
             self.entries.push(frames.with_answers(entry, &frames.positions_m(&found)));
         }
-        for (name, words) in [("bow", &views.bow)] {
+        for (name, words) in [("bow", &views.bow), ("bow-surf", &views.bow_surf)] {
             if let Some(words) = words {
                 self.add_words(base, frames, name, words);
             }

@@ -67,6 +67,7 @@ impl LocalDescriptors {
 pub struct Views {
     pub aligned: Option<Vec<Signature>>,
     pub bow: Option<BagOfWords>,
+    pub bow_surf: Option<BagOfWords>,
 }
 
 /// One frame.
@@ -74,6 +75,7 @@ pub struct Views {
 struct View {
     aligned: Signature,
     patches: Vec<f32>,
+    surf: Vec<f32>,
 }
 
 impl Views {
@@ -89,7 +91,7 @@ impl Views {
         on_frames: impl Fn(usize),
     ) -> Result<Self, SurveyError> {
         let wants = |baseline: Baseline| wanted.contains(&baseline);
-        if !wants(Baseline::Aligned) && !wants(Baseline::Bow) {
+        if !wants(Baseline::Aligned) && !wants(Baseline::Bow) && !wants(Baseline::BowSurf) {
             return Ok(Self::default());
         }
         let signatures = Signatures::new();
@@ -100,6 +102,7 @@ impl Views {
             } else {
                 Vec::new()
             },
+            surf: if wants(Baseline::BowSurf) { surf(panorama) } else { Vec::new() },
         };
         let mut views = Vec::new();
         for recording in recordings {
@@ -113,7 +116,21 @@ impl Views {
         };
         Ok(Self {
             bow: wants(Baseline::Bow).then(|| words(PATCH_COEFFICIENTS, |view| &view.patches)),
+            bow_surf: wants(Baseline::BowSurf).then(|| words(SURF_DIMENSIONS, |view| &view.surf)),
             aligned: wants(Baseline::Aligned).then(|| views.into_iter().map(|view| view.aligned).collect()),
         })
     }
+}
+
+const SURF_DIMENSIONS: usize = 64;
+
+#[cfg(feature = "surf")]
+fn surf(panorama: &Panorama) -> Vec<f32> {
+    super::surf::describe_panorama(panorama).into_iter().flat_map(|point| point.descriptor).collect()
+}
+
+/// Never asked for: [`Baseline::check`].
+#[cfg(not(feature = "surf"))]
+fn surf(_: &Panorama) -> Vec<f32> {
+    Vec::new()
 }

@@ -16,20 +16,32 @@ use crate::types::distance_m;
 pub struct Drive {
     first: usize,
     /// Number of indices from the first to the last.
-    length: usize,
+    indices: usize,
 }
+
+/// A drive is told apart into so many places at most: indices may be anything.
+const MAX_PLACES: usize = 4096;
 
 impl Drive {
     /// The part of the drive that the frames of `rows` are from; `None` without frames.
     pub fn of(rows: &[&Entry]) -> Option<Self> {
         let indices = || rows.iter().flat_map(|entry| entry.frames.iter().flatten().map(|frame| frame.index));
         let (first, last) = (indices().min()?, indices().max()?);
-        Some(Self { first, length: last - first + 1 })
+        Some(Self { first, indices: (last - first).saturating_add(1) })
+    }
+
+    fn places(&self) -> usize {
+        self.indices.min(MAX_PLACES)
+    }
+
+    fn place_of(&self, index: usize) -> usize {
+        let along = (index - self.first) as f64 / self.indices as f64;
+        ((along * self.places() as f64) as usize).min(self.places() - 1)
     }
 
     /// Which of the [`STRETCHES`] a frame lies in.
     pub fn stretch_of(&self, index: usize) -> usize {
-        (index - self.first) * STRETCHES / self.length
+        self.place_of(index) * STRETCHES / self.places()
     }
 }
 
@@ -38,8 +50,8 @@ impl Drive {
 pub struct Draw {
     /// Seeds, as often as they were drawn.
     seeds: Vec<usize>,
-    /// Of the drive's indices; `None` where each counts once.
-    times: Option<(usize, Vec<u8>)>,
+    /// Of the drive's places; `None` where each counts once.
+    times: Option<(Drive, Vec<u8>)>,
 }
 
 impl Draw {
@@ -58,7 +70,7 @@ impl Draw {
     }
 
     pub fn times(&self, index: usize) -> usize {
-        self.times.as_ref().map_or(1, |(first, times)| usize::from(times[index - first]))
+        self.times.as_ref().map_or(1, |(drive, times)| usize::from(times[drive.place_of(index)]))
     }
 }
 
@@ -66,18 +78,19 @@ impl Draw {
 /// after the last, so that every frame is drawn equally often.
 pub fn draws(drive: &Drive, seeds: usize, seed: u64) -> Vec<Draw> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let stretch = drive.length.div_ceil(STRETCHES);
+    let places = drive.places();
+    let stretch = places.div_ceil(STRETCHES);
     (0..DRAWS)
         .map(|_| {
-            let mut times = vec![0_u8; drive.length];
+            let mut times = vec![0_u8; places];
             for _ in 0..STRETCHES {
-                let start = random.random_range(0..drive.length);
+                let start = random.random_range(0..places);
                 for i in start..start + stretch {
-                    times[i % drive.length] += 1;
+                    times[i % places] += 1;
                 }
             }
             let seeds = (0..seeds).map(|_| random.random_range(0..seeds)).collect();
-            Draw { seeds, times: Some((drive.first, times)) }
+            Draw { seeds, times: Some((*drive, times)) }
         })
         .collect()
 }
@@ -216,20 +229,8 @@ impl ErrorsOfSeed {
 
 #[cfg(test)]
 mod tests {
+    use super::super::tests::entry;
     use super::*;
-    use crate::evaluate::FrameEntry;
-
-    fn entry(seed: u64, errors_m: &[(usize, Option<f64>)]) -> Entry {
-        let frame = |&(index, error_m): &(usize, Option<f64>)| FrameEntry {
-            index,
-            truth_e_m: 5.0,
-            truth_n_m: 7.0,
-            est_e_m: error_m.map(|error_m| 5.0 + error_m),
-            est_n_m: error_m.map(|_| 7.0),
-            ..FrameEntry::default()
-        };
-        Entry { seed: Some(seed), frames: Some(errors_m.iter().map(frame).collect()), ..Entry::default() }
-    }
 
     #[test]
     fn figures_without_a_draw_are_those_of_the_errors() {
@@ -245,7 +246,7 @@ mod tests {
 
     #[test]
     fn a_draw_counts_every_frame_equally_often_on_average_and_neighbours_together() {
-        let drive = Drive { first: 100, length: 400 };
+        let drive = Drive { first: 100, indices: 400 };
         let draws = draws(&drive, 3, 1);
         for index in [100, 255, 499] {
             let mean = draws.iter().map(|draw| draw.times(index)).sum::<usize>() as f64 / draws.len() as f64;
@@ -258,6 +259,14 @@ mod tests {
         };
         assert!(together(1) > 0.8 && together(10) > 0.3 && together(40).abs() < 0.15);
         assert!(draws.iter().all(|draw| draw.seeds().len() == 3));
+    }
+
+    #[test]
+    fn any_indices_are_places() {
+        let drive = Drive { first: 7, indices: u32::MAX as usize };
+        assert_eq!((drive.place_of(7), drive.stretch_of(7)), (0, 0));
+        let last = 7 + drive.indices - 1;
+        assert_eq!((drive.place_of(last), drive.stretch_of(last)), (MAX_PLACES - 1, STRETCHES - 1));
     }
 
     #[test]

@@ -247,3 +247,88 @@ fn of_method(
         median_of_seeds_m: seeds().map(|f| f.median_m).collect(),
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::evaluate::FrameEntry;
+
+    /// A row with frames that err by so much; `None`: no estimate.
+    pub fn entry(seed: u64, errors_m: &[(usize, Option<f64>)]) -> Entry {
+        let frame = |&(index, error_m): &(usize, Option<f64>)| FrameEntry {
+            index,
+            truth_e_m: 5.0,
+            truth_n_m: 7.0,
+            est_e_m: error_m.map(|error_m| 5.0 + error_m),
+            est_n_m: error_m.map(|_| 7.0),
+            ..FrameEntry::default()
+        };
+        let frames = errors_m.iter().map(frame).collect();
+        Entry { seed: Some(seed), estimator: "single", frames: Some(frames), ..Entry::default() }
+    }
+
+    /// A row of every seed: a quarter of the frames of a drive of 400, whose errors are `error_m` of the frame.
+    fn rows(recipe: Option<&'static str>, features: &str, seeds: u64, error_m: impl Fn(usize) -> f64) -> Vec<Entry> {
+        let of_seed = |seed: u64| {
+            let frames = (0..400).filter(|i| (i * 7 + seed as usize * 3) % 4 == 0);
+            let errors_m: Vec<(usize, Option<f64>)> = frames.map(|i| (i, Some(error_m(i)))).collect();
+            Entry { recipe, features: features.into(), split: Some("random".into()), ..entry(seed, &errors_m) }
+        };
+        (0..seeds).map(of_seed).collect()
+    }
+
+    #[test]
+    fn methods_are_compared_with_the_last_row_of_the_last_recipe() {
+        let wavy = |i: usize| 1.5 + (i as f64 * 0.05).sin();
+        let mut entries = rows(Some("paper"), "fft", 3, |i| wavy(i) + 0.5);
+        entries.extend(rows(Some("default"), "fused", 3, wavy));
+        entries.extend(rows(None, "as-good", 3, |i| wavy(i) + if i / 20 % 2 == 0 { 0.3 } else { -0.3 }));
+        let labels = rows(None, "bow", 3, |_| 0.0).into_iter();
+        entries.extend(labels.map(|entry| Entry { classified_share: Some(1.0), ..entry }));
+        entries.extend(rows(None, "median", 3, |_| 30.0));
+        let statistics = Statistics::of(&entries);
+        assert_eq!(statistics.methods.len(), 5);
+        let compared: Vec<(&str, bool)> =
+            statistics.comparisons.iter().map(|c| (c.method.features.as_str(), c.is_real)).collect();
+        assert_eq!(compared, [("fft", true), ("as-good", false), ("median", true)]);
+        let fft = &statistics.comparisons[0];
+        assert_eq!((fft.reference.features.as_str(), fft.seeds, fft.frames), ("fused", 3, 300));
+        let Estimate { value, low, high } = fft.mean_difference_m;
+        assert!([value, low, high].iter().all(|difference| (difference - 0.5).abs() < 1e-9), "{fft:?}");
+        assert_eq!(fft.closer_share.value, 0.0);
+        let fused = &statistics.methods[1];
+        assert!(fused.rmse_m.low < fused.rmse_m.value && fused.rmse_m.value < fused.rmse_m.high, "{fused:?}");
+        assert!(fused.skill.expect("there is a median").value > 0.9 && fused.rmse_of_seeds_m.len() == 3);
+        let lines = text(&statistics).lines().count();
+        assert_eq!(lines, 1 + 1 + 1 + 5, "{}", text(&statistics));
+    }
+
+    /// Errors of neighbours are alike over some ten frames; the mean of all drives is 1.
+    #[test]
+    fn intervals_hold_the_figure_of_all_drives_as_often_as_they_say() {
+        let mut random = ChaCha8Rng::seed_from_u64(3);
+        let drives = 120;
+        let holds = |random: &mut ChaCha8Rng| {
+            let mut state = 0.0;
+            let errors_m: Vec<(usize, Option<f64>)> = (0..400)
+                .map(|i| {
+                    state = 0.9 * state + 0.19_f64.sqrt() * random.random_range(-1.0..1.0);
+                    (i, Some(5.0 + state))
+                })
+                .collect();
+            let row = entry(0, &errors_m);
+            let errors = Errors::of(&[&row]);
+            let drive = bootstrap::Drive::of(&[&row]).expect("there are frames");
+            let drawn =
+                draws(&drive, 1, 0).into_iter().step_by(4).filter_map(|draw| Some(errors.figures(&draw)?.mean_m));
+            let Estimate { low, high, .. } = Estimate::of(5.0, drawn.collect());
+            (low..high).contains(&5.0)
+        };
+        let held = (0..drives).filter(|_| holds(&mut random)).count();
+        // Blocks of twice the length of what is alike make intervals a little short: 90 %, and three deviations below.
+        assert!(held as f64 > 0.82 * f64::from(drives), "{held} of {drives}");
+    }
+}
