@@ -21,12 +21,12 @@ fn protocol_report() -> PathBuf {
     static FOLDER: OnceLock<TempDir> = OnceLock::new();
     let folder = FOLDER.get_or_init(|| {
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let recording = courtyard(folder.path(), 40);
+        let recording = courtyard(folder.path(), 24);
         let report = folder.path().join("report");
         let (code, stdout, stderr) = run(omniloc()
             .arg("evaluate")
             .arg(&recording)
-            .args(["--features", "sp", "--seeds", "2", "--variants", "plain,noisy", "--grid-step-m", "5", "--report"])
+            .args(["--features", "sp", "--seeds", "2", "--variants", "plain", "--grid-step-m", "5", "--report"])
             .arg(&report));
         assert_eq!(code, 0, "{stderr}");
         assert!(stdout.contains("report/index.html") && stderr.contains("report: drawing"), "{stdout}{stderr}");
@@ -53,7 +53,7 @@ fn map_report() -> PathBuf {
             .arg(common::map::map())
             .arg("--survey")
             .arg(common::map::folder().join("survey.mcap"))
-            .arg("--report")
+            .args(["--baselines", "nearest", "--report"])
             .arg(&report));
         assert_eq!(code, 0, "{stderr}");
         folder
@@ -104,8 +104,16 @@ fn between<'a>(text: &'a str, before: &str, after: &str) -> Vec<&'a str> {
 #[test]
 fn a_report_is_a_page_with_its_figures_and_all_their_numbers() {
     for (report, expected, left_out) in [
-        (protocol_report(), &["comparison", "elimination", "tiles", "reliability"][..], "The drive, second by second"),
-        (map_report(), &["timeline", "estimates", "error-map", "likelihood", "surfaces"], "Backward elimination"),
+        (
+            protocol_report(),
+            &["comparison", "paired", "elimination", "words", "tiles"][..],
+            "The drive, second by second",
+        ),
+        (
+            map_report(),
+            &["timeline", "estimates", "error-map", "likelihood", "surfaces", "reliability"],
+            "Backward elimination",
+        ),
     ] {
         let (page, json) = (page(&report), json(&report));
         assert_eq!(names(&report), ["figures", "index.html", "report.json"]);
@@ -163,7 +171,7 @@ fn what_is_drawn_is_what_the_results_say() {
     let dataset = &json["datasets"][0];
     let fused = dataset["results"].as_array().expect("a list").iter().find(|entry| entry["features"] == "fused");
     let frames = fused.expect("a fused row")["frames"].as_array().expect("frames");
-    let panels = json["figures"]["evening-estimates"]["data"].as_array().expect("panels");
+    let panels = json["figures"]["corridor-7-day-2-estimates"]["data"].as_array().expect("panels");
     let drawn = panels[0]["frames"].as_array().expect("frames");
     assert_eq!((frames.len(), drawn.len()), (60, 60));
     for (result, drawn) in frames.iter().zip(drawn) {
@@ -174,8 +182,11 @@ fn what_is_drawn_is_what_the_results_say() {
         }
     }
     // Each frame is one dot on the map.
-    let svg = fs::read_to_string(map_report().join("figures/evening-error-map.svg")).expect("readable");
-    assert_eq!(svg.matches("<title>frame ").count(), panels_frames(&json["figures"]["evening-error-map"]["data"]));
+    let svg = fs::read_to_string(map_report().join("figures/corridor-7-day-2-error-map.svg")).expect("readable");
+    assert_eq!(
+        svg.matches("<title>frame ").count(),
+        panels_frames(&json["figures"]["corridor-7-day-2-error-map"]["data"])
+    );
     assert!(json["program"] == env!("CARGO_PKG_VERSION") && json["command"].as_array().expect("a list").len() > 5);
     let facts = &dataset["facts"];
     assert_eq!(facts["SHA-256"].as_str().expect("a text").len(), 64);

@@ -144,7 +144,7 @@ impl Dataset {
             frames: survey.len(),
             unusable: recording.unusable.len(),
             length_m: recording.length_m(),
-            duration_s: times_s().last().zip(times_s().next()).filter(|_| timed).map(|(last, first)| last - first),
+            duration_s: times_s().next_back().zip(times_s().next()).filter(|_| timed).map(|(last, first)| last - first),
             extent_m: [extent(0), extent(1)],
             with_yaw: survey.frames.iter().filter(|frame| frame.yaw_rad.is_some()).count(),
             position_std_m: stated_m.get(stated_m.len() / 2).copied(),

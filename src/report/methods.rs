@@ -2,7 +2,7 @@
 
 use super::chart::color::{BLACK, BLUE, GREEN, MUTED, ORANGE, PURPLE, SKY, VERMILION};
 use super::dataset::Dataset;
-use crate::evaluate::statistics::{Comparison, MethodStatistics, Statistics};
+use crate::evaluate::statistics::{self, Comparison, MethodStatistics, Statistics};
 use crate::evaluate::{Entry, FrameEntry};
 use crate::features::Descriptor;
 use crate::types::PositionM;
@@ -71,6 +71,12 @@ impl<'a> Method<'a> {
     /// What an entry's method is called.
     pub fn name_of(entry: &Entry) -> String {
         Method::of(entry).label
+    }
+
+    /// What the statistics' method is called.
+    pub fn name_of_parts(of: &statistics::Method) -> String {
+        let (recipe, features, estimator) = (of.recipe, of.features.clone(), of.estimator);
+        Self::name_of(&Entry { recipe, features, estimator, ..Entry::default() })
     }
 
     /// Errors of all frames that have an estimate, seed after seed.

@@ -194,7 +194,8 @@ fn distribution_panel(title: &str, methods: &[&Method], width_px: f64) -> Panel 
         .iter()
         .filter_map(|m| {
             let errors_m = m.sorted_errors_m();
-            errors_m.get(errors_m.len() / 20).copied()
+            // Errors of labels may be zero.
+            errors_m.get(errors_m.len() / 20).copied().filter(|error_m| *error_m > 0.0)
         })
         .collect();
     firsts.sort_unstable_by(f64::total_cmp);

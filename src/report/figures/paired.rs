@@ -22,6 +22,7 @@ struct Compared<'a> {
 pub fn paired(dataset: &Dataset) -> Drawn {
     const TITLE: &str = "Which differences are real";
     let mut shown: Vec<(String, Vec<Compared>)> = Vec::new();
+    let mut references: Vec<String> = Vec::new();
     for (split, title) in cases(dataset) {
         let all = methods(dataset, split.as_deref());
         let compared = |method: &Method| {
@@ -31,12 +32,8 @@ pub fn paired(dataset: &Dataset) -> Drawn {
         };
         let compared: Vec<Compared> = all.iter().filter_map(compared).collect();
         if let Some(first) = compared.first() {
-            let reference = all.iter().find(|method| {
-                let (entry, of) = (method.entries[0], &first.comparison.reference);
-                (entry.recipe, &entry.features) == (of.recipe, &of.features)
-            });
-            let than = reference.map(|method| format!(", against {}", method.label)).unwrap_or_default();
-            shown.push((format!("{}{than}", capitalized(&title)), compared));
+            references.push(Method::name_of_parts(&first.comparison.reference));
+            shown.push((capitalized(&title), compared));
         }
     }
     if shown.is_empty() {
@@ -46,9 +43,13 @@ pub fn paired(dataset: &Dataset) -> Drawn {
         .iter()
         .flat_map(|(_, all)| all.iter().map(|one| json!({"method": one.label, "comparison": one.comparison})))
         .collect();
-    let caption = "Mean error of each method minus that of the method named above, on the same frames: to the right of zero \
-                   it is worse. Lines: 95 % of bootstrap draws of stretches of the drive. Filled: real, with p below 0.05 \
-                   after Holm’s correction for all comparisons of the table; hollow: could be chance.";
+    references.dedup();
+    let caption = format!(
+        "Mean error of each method minus that of the {}, on the same frames: to the right of zero it is worse. Lines: 95 % of \
+         bootstrap draws of stretches of the drive. Filled: real, with p below 0.05 after Holm’s correction for all \
+         comparisons of the table; hollow: could be chance.",
+        references.join(", or the ")
+    );
     let figure = Figure::new(format!("{}-paired", dataset.id), TITLE, caption, json!(data));
     figure.halves(|width_px| shown.iter().map(|(title, all)| panel(title, all, width_px)).collect()).into()
 }

@@ -20,7 +20,7 @@ pub fn splits(dataset: &Dataset) -> Drawn {
     if let (Some(map), Some(insight)) = (&dataset.map, dataset.insights.first()) {
         let names: Vec<&str> = map.info.recordings.iter().map(|recording| recording.name.as_str()).collect();
         let caption = format!(
-            "The map was learned from {}. Frames are looked for in the gray cells only; a frame taken outside of them \
+            "The map was learned from {}. Frames are looked for in the pale blue cells only; a frame taken outside of them \
              cannot be found.",
             names.join(", ")
         );

@@ -83,7 +83,8 @@ fn mean_panel(dataset: &Dataset, insight: &Insight, name: &str, surface: &Surfac
     for &position_m in &insight.learning_m {
         plot.dot(position_m, 1.3, Paint::fill(INK).opacity(0.7));
     }
-    plot.color_bar("value of the feature, in its standard deviations", range, ColorMap::Diverging);
+    let unit = if insight.recipe == "paper" { "its standard deviations" } else { "standard deviations of its noise" };
+    plot.color_bar(&format!("value of the feature, in {unit}"), range, ColorMap::Diverging);
     plot.finish()
 }
 

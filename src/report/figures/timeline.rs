@@ -59,6 +59,20 @@ fn radius_95_m(answer: &FrameAnswer) -> f64 {
     (a * b).sqrt()
 }
 
+/// The radius that nearly all regions stay below, so that the shade fits in.
+fn usual_radius_m(answers: &[FrameAnswer]) -> f64 {
+    let mut radii_m: Vec<f64> = answers.iter().map(radius_95_m).collect();
+    radii_m.sort_unstable_by(f64::total_cmp);
+    radii_m.get(radii_m.len() * 49 / 50).copied().unwrap_or(1.0)
+}
+
+/// Where the axis begins: errors below it are drawn on it.
+fn lowest_m(answers: &[FrameAnswer]) -> f64 {
+    let mut errors_m: Vec<f64> = answers.iter().map(FrameAnswer::error_m).collect();
+    errors_m.sort_unstable_by(f64::total_cmp);
+    errors_m.get(errors_m.len() / 20).map_or(0.05, |error_m| error_m.clamp(0.005, 0.1))
+}
+
 fn state_color(state: LocalizationState) -> &'static str {
     match state {
         LocalizationState::Unknown => FAINT,
@@ -74,7 +88,7 @@ fn panel(dataset: &Dataset, filtered: &ShownSequence, width_px: f64) -> Panel {
     let end_s = times.last().copied().unwrap_or(1.0);
     let single = &dataset.insights[0].frames;
     let all = single.iter().chain(&filtered.answers).map(FrameAnswer::error_m);
-    let (low, high) = (0.05, all.fold(2.0, f64::max) * 1.3);
+    let (low, high) = (lowest_m(single), all.fold(usual_radius_m(&filtered.answers), f64::max) * 1.3);
     let x = Axis::new("time since the first frame [s]", Scale::linear(0.0, end_s));
     let y = Axis::new("error [m], logarithmic", Scale::log(low, high));
     let mut spec = Spec::new("State, error and stated deviation", x, y);
