@@ -10,6 +10,7 @@ on every frame of the other days. Needs numpy, scipy and opencv-python.
 import argparse
 import csv
 import json
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -78,8 +79,8 @@ def reduced(panorama, factor):
     return cv2.resize(panorama, (COLUMNS // factor, ROWS // factor), interpolation=cv2.INTER_AREA)
 
 
-def orientations(panorama, factor, blur, contrast, bands):
-    """h_b(e, a) of src/features/gradient.rs: 12 x band x column."""
+def orientations(panorama, masked, factor, blur, contrast, bands):
+    """h_b(e, a) of src/features/gradient.rs: 12 x band x column; nothing in the thirty-seconds `masked` of the rows."""
     log = blurred(np.log(reduced(panorama, factor) + 16), blur)
     rows, columns = log.shape
     east = 0.5 * (np.roll(log, -1, 1) - np.roll(log, 1, 1))
@@ -94,14 +95,16 @@ def orientations(panorama, factor, blur, contrast, bands):
     size = bands * columns
     bins = np.bincount((lower % 12 * size + at).ravel(), (weight * (1 - share)).ravel(), 12 * size)
     bins += np.bincount(((lower + 1) % 12 * size + at).ravel(), (weight * share).ravel(), 12 * size)
-    return bins.reshape(12, bands, columns) / (rows // bands)
+    bins = bins.reshape(12, bands, columns) / (rows // bands)
+    bins[:, masked.start * bands // 32 : masked.stop * bands // 32] = 0
+    return bins
 
 
 def gradients(*sizes):
     """src/features/gradient.rs before the magnitudes: bin x band x harmonic."""
 
-    def describe(panorama):
-        bins = orientations(panorama, *sizes)
+    def describe(panorama, masked):
+        bins = orientations(panorama, masked, *sizes)
         return np.fft.rfft(bins, axis=2)[:, :, :13] / bins.shape[2]
 
     return describe
@@ -118,9 +121,9 @@ def waves():
     return np.array([np.einsum("i,j,b->ijb", cosine(u), cosine(v), wave).ravel() for u, v, _, wave in orders]).T
 
 
-def patches(panorama):
+def patches(panorama, masked=slice(0, 0)):
     """src/features/patches.rs: 416 x 31."""
-    cells = orientations(panorama, 2, 1.0, 8.0, 32).reshape(12, 16, 2, 64, 4).mean((2, 4))
+    cells = orientations(panorama, masked, 2, 1.0, 8.0, 32).reshape(12, 16, 2, 64, 4).mean((2, 4))
     cells = 0.25 * np.roll(cells, 1, 2) + 0.5 * cells + 0.25 * np.roll(cells, -1, 2)
     rows, columns = np.arange(13), np.arange(0, 64, 2)
     parts = [cells[:, rows[:, None] + i, (columns + j) % 64] for i in range(4) for j in range(4)]
@@ -149,13 +152,13 @@ def patch_words(x):
     return residual.ravel() / np.sqrt(len(words))
 
 
-def row_fourier(panorama):
+def row_fourier(panorama, _):
     """Menegatti, Maeda & Ishiguro (2004) on log gray: 1 x 32 x harmonic."""
     rows = np.log(reduced(panorama, 2) + 16).reshape(32, 2, -1).mean(1)
     return np.fft.rfft(rows, axis=1)[None, :, :13] / rows.shape[1]
 
 
-def census(panorama):
+def census(panorama, _):
     """Shares of brighter and darker neighbours in eight directions a ring: 8 x 32 x harmonic."""
     log = np.log(blurred(reduced(panorama, 2), 1.0) + 16)
     padded, planes = np.pad(log, ((0, 2), (0, 0)), "edge"), []
@@ -170,29 +173,27 @@ PLANES = {
     "coarse": gradients(4, 1.5, 4.0, 16),
     "rows": row_fourier,
     "census": census,
-    "patches": lambda panorama: kernel_mean(patches(panorama)),
-    "patch-words": lambda panorama: patch_words(patches(panorama)),
+    "patches": lambda panorama, masked: kernel_mean(patches(panorama, masked)),
+    "patch-words": lambda panorama, masked: patch_words(patches(panorama, masked)),
 }
 # Feature type: planes, opposite bins added, harmonics.
 SIGNATURES = {
-    "gradient": ("fine", False, 5),
-    "gradient-unsigned": ("fine", True, 5),
+    "gradient": ("fine", True, 5),
+    "gradient-signed": ("fine", False, 5),
     "gradient-coarse": ("coarse", False, 5),
     "row-fourier": ("rows", False, 13),
     "census": ("census", False, 9),
 }
-DEFAULT = ("gradient", "gradient-unsigned", "gradient-coarse", "patches", "patch-words")
+DEFAULT = ("gradient", "patches", "patch-words")
 # Added to the noise, as a share of its mean eigenvalue.
 RIDGE = {"patch-words": 2.0}
 
 
-def signature(planes, name, harmonics, bands=slice(None)):
+def signature(planes, name, harmonics):
     if name not in SIGNATURES:
         return planes[name]
     plane, unsigned, default_harmonics = SIGNATURES[name]
     spectrum = planes[plane]
-    count = spectrum.shape[-2]
-    spectrum = spectrum[..., slice(*(None if i is None else i * count // 32 for i in (bands.start, bands.stop))), :]
     if unsigned:
         spectrum = spectrum[..., :6, :, :] + spectrum[..., 6:, :, :]
     root = np.sqrt(np.abs(spectrum[..., : harmonics or default_harmonics])).reshape(*spectrum.shape[:-3], -1)
@@ -276,7 +277,7 @@ def locate(log_likelihood, cells, columns, step_m):
     return np.array(found)
 
 
-ROW = dict(signatures=DEFAULT, harmonics=None, bands=slice(None), features=96, length=1.5, kernel="gaussian",
+ROW = dict(signatures=DEFAULT, harmonics=None, prepared="as it is", features=192, length=1.5, kernel="gaussian",
            perturbations=True, noise="unknown-scale")
 TABLE = {
     "default": {},
@@ -286,15 +287,20 @@ TABLE = {
     "no perturbations": dict(perturbations=False),
     **{f"{name} alone": dict(signatures=(name,)) for name in (*SIGNATURES, "patches", "patch-words")},
     **{f"without {one}": dict(signatures=tuple(name for name in DEFAULT if name != one)) for one in DEFAULT},
-    "without patches and patch-words": dict(signatures=DEFAULT[:3]),
+    "with gradient-signed": dict(signatures=(*DEFAULT, "gradient-signed")),
+    "with gradient-coarse": dict(signatures=(*DEFAULT, "gradient-coarse")),
+    "with both": dict(signatures=(*DEFAULT, "gradient-signed", "gradient-coarse")),
+    "with both, 96 features": dict(signatures=(*DEFAULT, "gradient-signed", "gradient-coarse"), features=96),
     "with row-fourier": dict(signatures=(*DEFAULT, "row-fourier")),
     "with census": dict(signatures=(*DEFAULT, "census")),
     "3 harmonics": dict(harmonics=3),
     "9 harmonics": dict(harmonics=9),
-    "without the upper eighth of the rows": dict(bands=slice(4, 32)),
-    "without the lower eighth of the rows": dict(bands=slice(0, 28)),
+    "without the upper eighth of the rows": dict(prepared="upper eighth masked"),
+    "without the lower eighth of the rows": dict(prepared="lower eighth masked"),
+    "one mean and deviation of the gray values": dict(prepared="one mean and deviation"),
     "48 features": dict(features=48),
-    "192 features": dict(features=192),
+    "96 features": dict(features=96),
+    "300 features": dict(features=300),
     "length 1.0": dict(length=1.0),
     "length 1.75": dict(length=1.75),
     "matern-3/2, length 3": dict(kernel="matern-3/2", length=3.0),
@@ -302,14 +308,30 @@ TABLE = {
 }
 
 
-def described(folder, copies):
+def evened(panorama):
+    """The whole panorama brought to one mean and deviation."""
+    return (128 + 48 * (panorama - panorama.mean()) / (panorama.std() + 1)).clip(0, 255)
+
+
+# What is done to a panorama, perturbed or not, before it is described, and which thirty-seconds of its rows are masked.
+PREPARED = {
+    "as it is": (lambda panorama: panorama, slice(0, 0)),
+    "upper eighth masked": (lambda panorama: panorama, slice(0, 4)),
+    "lower eighth masked": (lambda panorama: panorama, slice(28, 32)),
+    "one mean and deviation": (evened, slice(0, 0)),
+}
+
+
+@cache
+def described(folder, copies, prepared):
     """Planes of all frames, and of `copies` perturbed copies of each: n x copies."""
+    prepare, masked = PREPARED[prepared]
     clean, other = {name: [] for name in PLANES}, {name: [] for name in PLANES}
     for number, panorama in enumerate(panoramas(folder)):
         again = [perturbed(panorama, np.random.default_rng([number, copy])) for copy in range(copies)]
         for name, describe in PLANES.items():
-            clean[name].append(describe(panorama))
-            other[name].append([describe(one) for one in again])
+            clean[name].append(describe(prepare(panorama), masked))
+            other[name].append([describe(prepare(one), masked) for one in again])
     return {k: np.array(v) for k, v in clean.items()}, {k: np.array(v) for k, v in other.items()}
 
 
@@ -324,25 +346,24 @@ def main():
     cv2.setNumThreads(1)
     every = slice(None, None, args.learn_every)
     at = positions(args.survey)[every]
-    clean, again = described(args.survey, 2)
-    days = [(described(folder, 0)[0], positions(folder)) for folder in args.other_days]
     low, high = at.min(0), at.max(0)
     columns, rows = (np.floor((high - low) / args.step_m + 1e-9) + 1).astype(int)
     grid = np.meshgrid(low[0] + args.step_m * np.arange(columns), low[1] + args.step_m * np.arange(rows))
     cells = np.stack(grid, -1).reshape(-1, 2)
-    print(f"{len(at)} learning images, median spacing {spacing_m(at):.2f} m; mean over {len(days)} days")
+    print(f"{len(at)} learning images, median spacing {spacing_m(at):.2f} m; mean over {len(args.other_days)} days")
     print(f"{'row':38} {'RMSE':>7} {'median':>7} {'P95':>7} {'>10 m':>7}")
     for name in args.rows.split(","):
         o = {**ROW, **(TABLE[name] or {})}
-        of = lambda planes: [signature(planes, one, o["harmonics"], o["bands"]) for one in o["signatures"]]
+        of = lambda planes: [signature(planes, one, o["harmonics"]) for one in o["signatures"]]
+        clean, again = described(args.survey, 2, o["prepared"])
         learned = [one[every] for one in of(clean)]
         groups = [] if TABLE[name] is None else [
             Group(here, (there[every] - here[:, None]).reshape(-1, here.shape[1]), at, cells, o, RIDGE.get(name, 0.05))
             for name, here, there in zip(o["signatures"], learned, of(again))
         ]
         figures = []
-        for planes, truth in days:
-            seen = of(planes)
+        for folder in args.other_days:
+            truth, seen = positions(folder), of(described(folder, 0, o["prepared"])[0])
             if groups:
                 total = sum(group.log_likelihood(one) for group, one in zip(groups, seen))
                 found = locate(total, cells, columns, args.step_m)

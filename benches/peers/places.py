@@ -146,9 +146,9 @@ def ours_split(recipe, dataset, splits):
 
 
 def collect(of_features, entries, recipe):
-    """Adds the estimates of every row of the recipe to those of its features."""
+    """Adds the single-frame estimates of every row of the recipe to those of its features."""
     for entry in entries:
-        if entry["recipe"] == recipe:
+        if entry["recipe"] == recipe and entry["estimator"] == "single":
             of_features.setdefault(entry["features"], []).append(estimates_of(entry))
 
 

@@ -93,8 +93,8 @@ impl Protocol<'_> {
         let mut results = CaseResults::default();
         for (recipe, similarity) in self.recipes.iter().zip(self.similarities) {
             let part = format!("{}, {}", recipe.name.name(), case.describe());
-            let learned_m = match self.smoothing(recipe) {
-                Smoothing::None => frames.recorded_m.clone(),
+            let (learned_m, remaining_std_m) = match self.smoothing(recipe) {
+                Smoothing::None => (frames.recorded_m.clone(), vec![0.0; survey.len()]),
                 Smoothing::Track => {
                     // The images of frames that are never learned from have no part in it.
                     let mut learned = case.split.learning.clone();
@@ -102,10 +102,18 @@ impl Protocol<'_> {
                         learned.extend(&case.split.validation);
                         learned.sort_unstable();
                     }
-                    smoother.smoothed(&learned, similarity.as_ref()).positions_m
+                    let smoothed = smoother.smoothed(&learned, similarity.as_ref());
+                    let remaining_std_m = smoothed.remaining_std_m(survey);
+                    (smoothed.positions_m, remaining_std_m)
                 }
             };
-            let trial = Trial { recipe, split: &case.split, grid_step_m, recorded_m: &learned_m };
+            let trial = Trial {
+                recipe,
+                split: &case.split,
+                grid_step_m,
+                recorded_m: &learned_m,
+                remaining_std_m: &remaining_std_m,
+            };
             let outcomes = run(survey, &trial, |step| on_step(&part, step))?;
             on_trial(&trial, &outcomes);
             for outcome in &outcomes.rows {

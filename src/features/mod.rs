@@ -20,8 +20,8 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::panorama::Panorama;
+use gradient::GradientSignature;
 pub use gradient::{COMPASS_BYTES, COMPASS_HARMONICS};
-use gradient::{GradientSignature, Sign};
 pub use patches::{COEFFICIENTS as PATCH_COEFFICIENTS, Patch};
 use patches::{KernelMean, Patches};
 use steerable::{Response, SteerablePyramid};
@@ -45,10 +45,6 @@ pub enum Descriptor {
     SpEnergy,
     /// Fourier signature of gradient orientations.
     Gradient,
-    /// The same with opposite orientations added.
-    GradientUnsigned,
-    /// [`Descriptor::Gradient`] at half the resolution.
-    GradientCoarse,
     /// Kernel mean of the patches all around.
     Patches,
     /// Patches aggregated by what they resemble.
@@ -56,7 +52,7 @@ pub enum Descriptor {
 }
 
 impl Descriptor {
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 9] = [
         Self::Fft,
         Self::Hist,
         Self::HistSqrt,
@@ -64,8 +60,6 @@ impl Descriptor {
         Self::SpLog,
         Self::SpEnergy,
         Self::Gradient,
-        Self::GradientUnsigned,
-        Self::GradientCoarse,
         Self::Patches,
         Self::PatchWords,
     ];
@@ -78,9 +72,7 @@ impl Descriptor {
             Self::Fft => fft::DIMENSIONS,
             Self::Hist | Self::HistSqrt => histogram::DIMENSIONS,
             Self::Sp | Self::SpLog | Self::SpEnergy => steerable::DIMENSIONS,
-            Self::Gradient => gradient::FINE.dimensions(Sign::Signed),
-            Self::GradientUnsigned => gradient::FINE.dimensions(Sign::Unsigned),
-            Self::GradientCoarse => gradient::COARSE.dimensions(Sign::Signed),
+            Self::Gradient => gradient::DIMENSIONS,
             Self::Patches => patches::DIMENSIONS,
             Self::PatchWords => words::DIMENSIONS,
         }
@@ -96,8 +88,6 @@ impl Descriptor {
             Self::SpLog => "sp-log",
             Self::SpEnergy => "sp-energy",
             Self::Gradient => "gradient",
-            Self::GradientUnsigned => "gradient-unsigned",
-            Self::GradientCoarse => "gradient-coarse",
             Self::Patches => "patches",
             Self::PatchWords => "patch-words",
         }
@@ -139,12 +129,14 @@ impl From<Descriptor> for String {
     }
 }
 
+/// Descriptors that are made of the orientations of gradients.
+const OF_ORIENTATIONS: [Descriptor; 3] = [Descriptor::Gradient, Descriptor::Patches, Descriptor::PatchWords];
+
 /// Computes descriptors, with the plans and buffers they need: nothing is allocated per frame.
 pub struct Describer {
     fft: fft::FftDescriptor,
     pyramid: SteerablePyramid<f32>,
     gradient: GradientSignature,
-    gradient_coarse: GradientSignature,
     patches: Patches,
     kernel_mean: KernelMean,
     words: PatchWords,
@@ -161,8 +153,7 @@ impl Describer {
         Self {
             fft: fft::FftDescriptor::new(),
             pyramid: SteerablePyramid::new(),
-            gradient: GradientSignature::new(gradient::FINE),
-            gradient_coarse: GradientSignature::new(gradient::COARSE),
+            gradient: GradientSignature::new(),
             patches: Patches::new(),
             kernel_mean: KernelMean::new(),
             words: PatchWords::new(),
@@ -175,15 +166,11 @@ impl Describer {
     /// When one of `properties` is not [`Descriptor::dimensions`] long.
     pub fn describe(&mut self, descriptors: &[Descriptor], panorama: &Panorama, properties: &mut [Vec<f32>]) {
         let wanted = |of: &[Descriptor]| descriptors.iter().any(|descriptor| of.contains(descriptor));
-        const OF_PATCHES: [Descriptor; 2] = [Descriptor::Patches, Descriptor::PatchWords];
-        if wanted(&[Descriptor::Gradient, Descriptor::GradientUnsigned]) || wanted(&OF_PATCHES) {
+        if wanted(&OF_ORIENTATIONS) {
             self.gradient.look(panorama);
         }
-        if wanted(&OF_PATCHES) {
+        if wanted(&[Descriptor::Patches, Descriptor::PatchWords]) {
             self.patches.look(self.gradient.orientations());
-        }
-        if wanted(&[Descriptor::GradientCoarse]) {
-            self.gradient_coarse.look(panorama);
         }
         for (&descriptor, properties) in descriptors.iter().zip(properties) {
             assert_eq!(properties.len(), descriptor.dimensions(), "room for the properties of {descriptor}");
@@ -194,9 +181,7 @@ impl Describer {
                 Descriptor::Sp => self.pyramid.describe(panorama, Response::Magnitude, properties),
                 Descriptor::SpLog => self.pyramid.describe(panorama, Response::LogMagnitude, properties),
                 Descriptor::SpEnergy => self.pyramid.describe(panorama, Response::Energy, properties),
-                Descriptor::Gradient => self.gradient.describe(Sign::Signed, properties),
-                Descriptor::GradientUnsigned => self.gradient.describe(Sign::Unsigned, properties),
-                Descriptor::GradientCoarse => self.gradient_coarse.describe(Sign::Signed, properties),
+                Descriptor::Gradient => self.gradient.describe(properties),
                 Descriptor::Patches => self.kernel_mean.describe(self.patches.all(), properties),
                 Descriptor::PatchWords => self.words.describe(self.patches.all(), properties),
             }
@@ -212,12 +197,12 @@ impl Describer {
     }
 
     /// The compass signature of `panorama`, [`COMPASS_BYTES`] long. Costs next to nothing right after a description of the
-    /// same panorama with [`Descriptor::GradientCoarse`].
+    /// same panorama with a descriptor of gradient orientations.
     pub fn compass(&mut self, described: &[Descriptor], panorama: &Panorama, signature: &mut [i8]) {
-        if !described.contains(&Descriptor::GradientCoarse) {
-            self.gradient_coarse.look(panorama);
+        if !described.iter().any(|descriptor| OF_ORIENTATIONS.contains(descriptor)) {
+            self.gradient.look(panorama);
         }
-        self.gradient_coarse.compass(signature);
+        self.gradient.compass(signature);
     }
 
     /// Vectors of the right lengths for [`describe`](Self::describe).

@@ -4,13 +4,13 @@ use std::f32::consts::{PI, TAU};
 
 use multiversion::multiversion;
 
-use super::gradient::{BINS, FINE_BANDS, FINE_COLUMNS};
+use super::gradient::{self, BINS};
 
-/// A cell is so many columns and bands of the fine gradient signature: 4 × 4 pixels of 256 × 64.
+/// A cell is so many columns and bands of the gradient signature: 4 × 4 pixels of 256 × 64.
 const COLUMNS_A_CELL: usize = 4;
 const BANDS_A_CELL: usize = 2;
-const COLUMNS: usize = FINE_COLUMNS / COLUMNS_A_CELL;
-const ROWS: usize = FINE_BANDS / BANDS_A_CELL;
+const COLUMNS: usize = gradient::COLUMNS / COLUMNS_A_CELL;
+const ROWS: usize = gradient::BANDS / BANDS_A_CELL;
 const CELLS: usize = ROWS * COLUMNS;
 /// Cells along a side of a patch, which is 22° wide.
 const SIDE: usize = 4;
@@ -93,10 +93,10 @@ impl Patches {
 
     /// Takes in the patches of a panorama with these `orientations`, bin × band × column.
     pub fn look(&mut self, orientations: &[f32]) {
-        assert_eq!(orientations.len(), BINS * FINE_BANDS * FINE_COLUMNS, "one value a bin, band and column");
+        assert_eq!(orientations.len(), BINS * gradient::BANDS * gradient::COLUMNS, "one value a bin, band and column");
         self.weights.fill(0.0);
         self.waves.fill(0.0);
-        for (b, bin) in orientations.chunks_exact(FINE_BANDS * FINE_COLUMNS).enumerate() {
+        for (b, bin) in orientations.chunks_exact(gradient::BANDS * gradient::COLUMNS).enumerate() {
             self.smooth(bin);
             self.weights.iter_mut().zip(&self.smoothed).for_each(|(weight, h)| *weight += h);
             self.smoothed.iter_mut().for_each(|h| *h = h.sqrt());
@@ -115,10 +115,10 @@ impl Patches {
 
     /// smoothed = cells of one orientation bin.
     fn smooth(&mut self, bin: &[f32]) {
-        let rows = bin.chunks_exact(BANDS_A_CELL * FINE_COLUMNS);
+        let rows = bin.chunks_exact(BANDS_A_CELL * gradient::COLUMNS);
         for (smoothed, bands) in self.smoothed.chunks_exact_mut(COLUMNS).zip(rows) {
             let mut means = [0.0; COLUMNS];
-            for band in bands.chunks_exact(FINE_COLUMNS) {
+            for band in bands.chunks_exact(gradient::COLUMNS) {
                 for (mean, columns) in means.iter_mut().zip(band.chunks_exact(COLUMNS_A_CELL)) {
                     *mean += columns.iter().sum::<f32>() / (BANDS_A_CELL * COLUMNS_A_CELL) as f32;
                 }
@@ -266,7 +266,7 @@ mod tests {
 
     fn orientations() -> Vec<f32> {
         let mut random = SplitMix(7);
-        (0..BINS * FINE_BANDS * FINE_COLUMNS).map(|_| (3.0 * random.uniform()).powi(3) as f32).collect()
+        (0..BINS * gradient::BANDS * gradient::COLUMNS).map(|_| (3.0 * random.uniform()).powi(3) as f32).collect()
     }
 
     /// The definition, written out: one patch at a time, all 192 numbers of it.
@@ -318,7 +318,7 @@ mod tests {
     fn a_turn_reorders_the_patches() {
         let before = orientations();
         let mut after = before.clone();
-        after.chunks_exact_mut(FINE_COLUMNS).for_each(|row| row.rotate_right(STEP * COLUMNS_A_CELL));
+        after.chunks_exact_mut(gradient::COLUMNS).for_each(|row| row.rotate_right(STEP * COLUMNS_A_CELL));
         let (mut one, mut other) = (Patches::new(), Patches::new());
         one.look(&before);
         other.look(&after);

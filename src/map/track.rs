@@ -42,6 +42,16 @@ pub enum TrackReport {
     LeftAlone(NotATrack),
 }
 
+impl TrackReport {
+    /// What is left of the error, one standard deviation on either axis; `None` where nothing is known of it.
+    pub fn remaining_std_m(&self) -> Option<f64> {
+        match *self {
+            Self::Smoothed { remaining_std_m, .. } => Some(remaining_std_m),
+            Self::LeftAlone(_) => None,
+        }
+    }
+}
+
 /// Why the frames of a recording are no track.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

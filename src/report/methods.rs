@@ -187,8 +187,6 @@ pub fn feature_name(name: &str) -> String {
         "sp-log" => "steerable pyramid (log)",
         "sp-energy" => "steerable pyramid (energy)",
         "gradient" => "gradients",
-        "gradient-unsigned" => "gradients, unsigned",
-        "gradient-coarse" => "gradients, coarse",
         "patch-words" => "patch words",
         "fused" => "all features",
         other => other,
@@ -199,8 +197,8 @@ pub fn feature_name(name: &str) -> String {
 fn type_dashes(name: &str) -> Option<&'static str> {
     match name.parse() {
         Ok(Descriptor::Fft | Descriptor::Gradient) => None,
-        Ok(Descriptor::Hist | Descriptor::GradientUnsigned) => Some("6 3"),
-        Ok(Descriptor::Sp | Descriptor::GradientCoarse) => Some("2 2"),
+        Ok(Descriptor::Hist) => Some("6 3"),
+        Ok(Descriptor::Sp) => Some("2 2"),
         Ok(Descriptor::Patches) => Some("8 3 2 3"),
         _ => Some("1 3"),
     }

@@ -77,7 +77,15 @@ pub fn train(
     // Measured before anything is learned from the validation frames.
     let held_out_m = held_out.as_ref().map_or(&positions_m, |smoothed| &smoothed.positions_m);
     let held_back = Recipe { refit: false, ..recipe.clone() };
-    let trial = Trial { recipe: &held_back, split: &split, grid_step_m: settings.grid_step_m, recorded_m: held_out_m };
+    let remaining_std_m =
+        held_out.as_ref().map_or_else(|| vec![0.0; survey.len()], |smoothed| smoothed.remaining_std_m(survey));
+    let trial = Trial {
+        recipe: &held_back,
+        split: &split,
+        grid_step_m: settings.grid_step_m,
+        recorded_m: held_out_m,
+        remaining_std_m: &remaining_std_m,
+    };
     let outcomes = run(survey, &trial, &on_step)?;
     let learning_m: Vec<_> = split.learning.iter().map(|&row| positions_m[row]).collect();
     let know_nothing_m = component_median(&learning_m);

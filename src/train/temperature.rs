@@ -3,6 +3,9 @@
 //! Features of one frame are not independent, and a group's k of them are not k observations; the summed log-likelihood
 //! is sharper than the errors are. Divided by the *temperature* T it is as sharp as frames that were held back show:
 //! p(cell) ∝ exp(log-likelihood / T).
+//!
+//! The positions of those frames err too, and what they err by must not be taken for errors of the frames: what is judged
+//! is p(position) = Σ p(cell) N(position; cell, σ² I), σ the deviation of the position.
 
 use rayon::prelude::*;
 
@@ -14,10 +17,18 @@ use crate::types::{PositionM, distance_m};
 const LOG2_QUARTERS: std::ops::RangeInclusive<i32> = -4..=28;
 /// Fewer frames than this say nothing about the spread of errors.
 const MIN_FRAMES: usize = 8;
+/// Cells that weigh less than this share of the nearest one are left out.
+const LEAST_WEIGHT: f64 = 1e-4;
 
-/// The temperature at which frames with these log-likelihoods (one row of cells each) most likely are at `truth_m`: least
-/// mean −log of the probability of the cell nearest the true position. `None` with too few frames.
-pub fn fit_temperature(cells: &CandidateCells, log_likelihoods: &[&[f32]], truth_m: &[PositionM]) -> Option<f64> {
+/// The temperature at which frames with these log-likelihoods (one row of cells each) most likely are at `positions_m`,
+/// which are known to `std_m` on either axis: least mean −log of the probability of the cell nearest the position, or of
+/// those around it if it may be wrong. `None` with too few frames.
+pub fn fit_temperature(
+    cells: &CandidateCells,
+    log_likelihoods: &[&[f32]],
+    positions_m: &[PositionM],
+    std_m: &[f64],
+) -> Option<f64> {
     if log_likelihoods.len() < MIN_FRAMES {
         return None;
     }
@@ -26,10 +37,10 @@ pub fn fit_temperature(cells: &CandidateCells, log_likelihoods: &[&[f32]], truth
     // Frame × temperature; summed in order, so that the same frames always give the same temperature.
     let surprises: Vec<Vec<f64>> = log_likelihoods
         .par_iter()
-        .zip(truth_m)
-        .map(|(row, &truth_m)| {
-            let at = nearest_cell(&centers_m, truth_m);
-            tried.iter().map(|&temperature| surprise(row, at, temperature)).collect()
+        .zip(positions_m.par_iter().zip(std_m))
+        .map(|(row, (&position_m, &std_m))| {
+            let there = cells_around(&centers_m, position_m, std_m);
+            tried.iter().map(|&temperature| surprise(row, &there, temperature)).collect()
         })
         .collect();
     let cost = |i: usize| surprises.iter().map(|of_frame| of_frame[i]).sum::<f64>();
@@ -57,11 +68,32 @@ pub fn credible_level(cells: &CandidateCells, log_likelihood: &[f32], truth_m: P
     likelier / relative.iter().sum::<f64>()
 }
 
-/// −log of the probability of cell `at`.
-fn surprise(log_likelihood: &[f32], at: usize, temperature: f64) -> f64 {
+/// −log of the mean probability of the cells `there`, by their weights, which sum to 1.
+fn surprise(log_likelihood: &[f32], there: &[(usize, f64)], temperature: f64) -> f64 {
     let relative = relative_probabilities(log_likelihood, temperature);
-    let greatest = f64::from(log_likelihood[most_likely_cell(log_likelihood)]);
-    (greatest - f64::from(log_likelihood[at])) / temperature + relative.iter().sum::<f64>().ln()
+    // By the likeliest of them: far from the summit all of them round to nothing.
+    let of = |cell: usize| f64::from(log_likelihood[cell]) / temperature;
+    let most = there.iter().map(|&(cell, _)| of(cell)).fold(f64::NEG_INFINITY, f64::max);
+    let mean = there.iter().map(|&(cell, weight)| weight * (of(cell) - most).exp()).sum::<f64>();
+    let greatest = of(most_likely_cell(log_likelihood));
+    greatest - most - mean.ln() + relative.iter().sum::<f64>().ln()
+}
+
+/// The cells in which something may be that is known to be at `position_m` to `std_m`, with weights that sum to 1: the
+/// nearest one alone if the position is exact, or the deviation far below a cell.
+fn cells_around(centers_m: &[PositionM], position_m: PositionM, std_m: f64) -> Vec<(usize, f64)> {
+    let nearest = nearest_cell(centers_m, position_m);
+    if std_m <= 0.0 {
+        return vec![(nearest, 1.0)];
+    }
+    // Relative to the nearest one, so that not all weights round to nothing.
+    let squared = |cell: usize| (distance_m(position_m, centers_m[cell]) / std_m).powi(2);
+    let least = squared(nearest);
+    let weights = (0..centers_m.len()).map(|cell| (cell, (0.5 * (least - squared(cell))).exp()));
+    let mut there: Vec<(usize, f64)> = weights.filter(|&(_, weight)| weight >= LEAST_WEIGHT).collect();
+    let total: f64 = there.iter().map(|(_, weight)| weight).sum();
+    there.iter_mut().for_each(|(_, weight)| *weight /= total);
+    there
 }
 
 /// Probabilities of the cells, up to a factor: 1 for the likeliest.
@@ -104,7 +136,7 @@ mod tests {
         for sharper in [1.0, 8.0, 32.0] {
             let (cells, rows, truth_m) = frames(sharper);
             let slices: Vec<&[f32]> = rows.iter().map(Vec::as_slice).collect();
-            let temperature = fit_temperature(&cells, &slices, &truth_m).expect("100 frames");
+            let temperature = fit_temperature(&cells, &slices, &truth_m, &[0.0; 100]).expect("100 frames");
             assert!((temperature / sharper).log2().abs() <= 0.51, "{temperature} for {sharper}");
             let covered = coverage(&cells, &rows, &truth_m, temperature);
             assert!((0.85..=1.0).contains(&covered), "{covered}");
@@ -113,9 +145,37 @@ mod tests {
         assert!(coverage(&cells, &rows, &truth_m, 1.0) < 0.4, "too sharp covers too little");
     }
 
+    /// Frames that are exact, at positions that err by 1 m on either axis: the frames are not to blame.
+    #[test]
+    fn errors_of_the_positions_are_not_taken_for_errors_of_the_frames() {
+        let (cells, _, positions_m) = frames(1.0);
+        let row: Vec<f32> =
+            cells.centers_m().iter().map(|c| -(50.0 * distance_m(*c, [10.0, 10.0]).powi(2)) as f32).collect();
+        let rows = vec![row.as_slice(); positions_m.len()];
+        let believed = |std_m: f64| fit_temperature(&cells, &rows, &positions_m, &[std_m; 100]).expect("100 frames");
+        // exp(-50 d²) is a deviation of 0.1 m; as they are taken for exact, frames seem to err by 1 m, 100 times the variance.
+        assert!((64.0..=128.0).contains(&believed(0.0)), "{}", believed(0.0));
+        assert!(believed(1.0) < 8.0, "{}", believed(1.0));
+        assert!(believed(0.7) < believed(0.3) && believed(0.3) < believed(0.0));
+    }
+
+    #[test]
+    fn weights_of_cells_are_those_of_the_normal_distribution() {
+        let centers_m = [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [40.0, 0.0]];
+        assert_eq!(cells_around(&centers_m, [0.9, 0.0], 0.0), [(1, 1.0)]);
+        assert_eq!(cells_around(&centers_m, [0.9, 0.0], 0.01), [(1, 1.0)]);
+        let there = cells_around(&centers_m, [0.5, 0.0], 1.0);
+        let sum = 2.0 + (-1.0_f64).exp();
+        let expected = [1.0 / sum, 1.0 / sum, (-1.0_f64).exp() / sum];
+        assert_eq!(there.len(), 3, "40 m is too far");
+        for (&(_, weight), expected) in there.iter().zip(expected) {
+            assert!((weight - expected).abs() < 1e-12, "{there:?}");
+        }
+    }
+
     #[test]
     fn a_handful_of_frames_says_nothing() {
         let (cells, rows, truth_m) = frames(1.0);
-        assert_eq!(fit_temperature(&cells, &[&rows[0]], &truth_m[..1]), None);
+        assert_eq!(fit_temperature(&cells, &[&rows[0]], &truth_m[..1], &[0.0]), None);
     }
 }

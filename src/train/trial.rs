@@ -30,6 +30,8 @@ pub struct Trial<'a> {
     /// Positions to learn from and to select on, one a frame of the survey; whatever was done to them, the test frames'
     /// images had no part in it.
     pub recorded_m: &'a [PositionM],
+    /// What they may still be off by, one standard deviation on either axis; 0 where nothing is known of it.
+    pub remaining_std_m: &'a [f64],
 }
 
 /// What a trial brought.
@@ -246,7 +248,8 @@ fn run_once(
     let rows: Vec<&[f32]> = fused.as_ref().map_or(Vec::new(), |[_, _, kept_validation]| {
         kept_validation.values.chunks_exact(kept_validation.cells).collect()
     });
-    let temperature = fit_temperature(&cells, &rows, &queries.validation_m);
+    let validation_std_m: Vec<f64> = split.validation.iter().map(|&row| trial.remaining_std_m[row]).collect();
+    let temperature = fit_temperature(&cells, &rows, &queries.validation_m, &validation_std_m);
     let least_resemblance = nowhere.and_then(|nowhere| {
         let truth_m = &queries.validation_m;
         let held_back = HeldBack { cells: &cells, log_likelihoods: &rows, nowhere: &nowhere, truth_m };

@@ -132,7 +132,9 @@ pub fn update(
     let of_drive: Vec<usize> = (0..tests.len()).filter(|&i| tests[i] >= joined.of_map).collect();
     let rows: Vec<&[f32]> = of_drive.iter().map(|&i| before[i].as_slice()).collect();
     let truth_m: Vec<PositionM> = of_drive.iter().map(|&i| joined.positions_m[tests[i]]).collect();
-    let temperature = fit_temperature(&cells, &rows, &truth_m).unwrap_or(map.info.temperature);
+    let remaining_std_m = track.and_then(|track| track.remaining_std_m()).unwrap_or(0.0);
+    let std_m = vec![remaining_std_m; of_drive.len()];
+    let temperature = fit_temperature(&cells, &rows, &truth_m, &std_m).unwrap_or(map.info.temperature);
     let temperature = temperature.max(map.info.temperature);
     let compass = joined.compass(map, survey, &positions_m);
     let info = MapInfo {

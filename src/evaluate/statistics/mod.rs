@@ -11,7 +11,8 @@
 //!   the share of sign flips, one sign a stretch, that make the mean difference of errors as large as it is: how often that
 //!   happens where neither method is better. All comparisons of one table count as one family (Holm 1979).
 //!
-//! What this assumes: stretches err independently of one another, and under "neither is better" a stretch's difference is
+//! What this assumes: stretches err independently of one another (on `drive-378` the correlation of errors falls below 0.2
+//! within 12 frames, a stretch has 19; where errors stay alike over half a stretch or more, intervals are too short), and under "neither is better" a stretch's difference is
 //! as likely to be of either sign. What it does not say: how figures vary from one drive, day or place to another. One
 //! drive is one drive; for that, evaluate others against a map.
 
@@ -273,7 +274,7 @@ mod tests {
     /// A row of every seed: a quarter of the frames of a drive of 400, whose errors are `error_m` of the frame.
     fn rows(recipe: Option<&'static str>, features: &str, seeds: u64, error_m: impl Fn(usize) -> f64) -> Vec<Entry> {
         let of_seed = |seed: u64| {
-            let frames = (0..400).filter(|i| (i * 7 + seed as usize * 3) % 4 == 0);
+            let frames = (0..400).filter(|i| (i * 7 + seed as usize * 3).is_multiple_of(4));
             let errors_m: Vec<(usize, Option<f64>)> = frames.map(|i| (i, Some(error_m(i)))).collect();
             Entry { recipe, features: features.into(), split: Some("random".into()), ..entry(seed, &errors_m) }
         };
@@ -306,7 +307,7 @@ mod tests {
         assert_eq!(lines, 1 + 1 + 1 + 5, "{}", text(&statistics));
     }
 
-    /// Errors of neighbours are alike over some ten frames; the mean of all drives is 1.
+    /// Errors of neighbours are alike, over a third of a stretch; the mean over all drives is 5.
     #[test]
     fn intervals_hold_the_figure_of_all_drives_as_often_as_they_say() {
         let mut random = ChaCha8Rng::seed_from_u64(3);
@@ -315,7 +316,7 @@ mod tests {
             let mut state = 0.0;
             let errors_m: Vec<(usize, Option<f64>)> = (0..400)
                 .map(|i| {
-                    state = 0.9 * state + 0.19_f64.sqrt() * random.random_range(-1.0..1.0);
+                    state = 0.75 * state + 0.66 * random.random_range(-1.0..1.0);
                     (i, Some(5.0 + state))
                 })
                 .collect();
@@ -328,7 +329,7 @@ mod tests {
             (low..high).contains(&5.0)
         };
         let held = (0..drives).filter(|_| holds(&mut random)).count();
-        // Blocks of twice the length of what is alike make intervals a little short: 90 %, and three deviations below.
-        assert!(held as f64 > 0.82 * f64::from(drives), "{held} of {drives}");
+        // A few blocks make intervals a little short: 90 % would be good, and this is three deviations below.
+        assert!(f64::from(held as u32) > 0.82 * f64::from(drives), "{held} of {drives}");
     }
 }

@@ -34,7 +34,7 @@ pub use write::to_bytes;
 use super::FeatureMap;
 
 /// What this build writes, and the only one it reads.
-pub const FORMAT_VERSION: u32 = 3;
+pub const FORMAT_VERSION: u32 = 4;
 const METADATA_KEY: &str = "omniloc";
 const CHECKSUM: &str = "sha256";
 const FIELDS: &str = "fields";
@@ -170,7 +170,7 @@ mod tests {
         let mut map = small_map();
         map.info.format_version = 7;
         let error = from_bytes(&to_bytes(&map)).expect_err("newer");
-        assert_eq!(error.to_string(), "map file is version 7, this build reads version 3: install a newer omniloc");
+        assert_eq!(error.to_string(), "map file is version 7, this build reads version 4: install a newer omniloc");
     }
 
     #[test]

@@ -64,6 +64,14 @@ pub struct Smoothed {
     pub reports: Vec<TrackReport>,
 }
 
+impl Smoothed {
+    /// What positions may still be off by, one a frame of `survey`; 0 where they were left alone.
+    pub fn remaining_std_m(&self, survey: &Survey) -> Vec<f64> {
+        let of = |recording: usize| self.reports[recording].remaining_std_m().unwrap_or(0.0);
+        survey.frames.iter().map(|frame| of(frame.recording)).collect()
+    }
+}
+
 impl Similarity {
     /// Of all frames of `survey`, by the shortest descriptor whose reaction to perturbations `recipe` has. `None` where it
     /// has none.

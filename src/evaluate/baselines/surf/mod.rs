@@ -94,15 +94,12 @@ pub fn describe_panorama(panorama: &Panorama) -> Vec<SurfPoint> {
 mod tests {
     use super::*;
 
-    /// A soft disk at (x, y) with a softer one beside it, so that there is an orientation.
+    /// A soft spot at (x, y) on a slope that rises towards `towards_rad`.
     fn blob(width: usize, height: usize, [x, y]: [f64; 2], radius_px: f64, towards_rad: f64) -> Vec<f32> {
-        let spot = |px: f64, py: f64, x: f64, y: f64, radius_px: f64| {
-            (-0.5 * ((px - x).powi(2) + (py - y).powi(2)) / radius_px.powi(2)).exp()
-        };
-        let (x2, y2) = (x + 2.5 * radius_px * towards_rad.cos(), y + 2.5 * radius_px * towards_rad.sin());
         let pixel = |i: usize| {
-            let (px, py) = ((i % width) as f64, (i / width) as f64);
-            40.0 + 150.0 * spot(px, py, x, y, radius_px) + 40.0 * spot(px, py, x2, y2, 0.8 * radius_px)
+            let (dx, dy) = ((i % width) as f64 - x, (i / width) as f64 - y);
+            let spot = (-0.5 * (dx * dx + dy * dy) / (radius_px * radius_px)).exp();
+            100.0 + 80.0 * spot + 1.5 * (dx * towards_rad.cos() + dy * towards_rad.sin())
         };
         (0..width * height).map(|i| pixel(i) as f32).collect()
     }
@@ -110,25 +107,31 @@ mod tests {
     #[test]
     fn a_blob_is_found_where_and_as_large_as_it_is() {
         let at = [81.3, 63.6];
-        let points = describe(&blob(160, 128, at, 4.0, 0.7), 160, &SurfSettings::default());
-        let strongest = points.first().expect("a blob");
-        // The softer spot pulls a little.
-        assert!((strongest.x_px - at[0]).abs() < 0.8 && (strongest.y_px - at[1]).abs() < 0.8, "{strongest:?}");
-        // The determinant of a Gaussian blob is greatest at its own deviation; box filters are rough.
-        assert!((3.0..5.5).contains(&strongest.scale_px), "{strongest:?}");
+        let of = |radius_px: f64| {
+            let points = describe(&blob(160, 128, at, radius_px, 0.7), 160, &SurfSettings::default());
+            points.first().expect("a blob").clone()
+        };
+        let (small, large) = (of(3.0), of(6.0));
+        for found in [&small, &large] {
+            assert!((found.x_px - at[0]).abs() < 0.3 && (found.y_px - at[1]).abs() < 0.3, "{found:?}");
+        }
+        // Box filters are rough; that twice the size is twice the scale they must show.
+        assert!((1.7..2.3).contains(&(large.scale_px / small.scale_px)), "{} {}", small.scale_px, large.scale_px);
     }
 
     #[test]
     fn descriptors_turn_with_the_image() {
         let of = |towards_rad: f64| {
-            describe(&blob(160, 160, [80.0, 80.0], 5.0, towards_rad), 160, &SurfSettings::default())[0].clone()
+            let image = blob(160, 160, [80.3, 79.6], 5.0, towards_rad);
+            describe(&image, 160, &SurfSettings::default()).first().expect("a blob").clone()
         };
         let straight = of(0.0);
         for towards_rad in [0.4, 1.3, -2.0] {
             let turned = of(towards_rad);
             let error_rad =
                 crate::types::wrap_angle_rad(turned.orientation_rad - straight.orientation_rad - towards_rad);
-            assert!(error_rad.abs() < 0.15, "{towards_rad}: {error_rad}");
+            // A round spot says little of a direction: half of a sector.
+            assert!(error_rad.abs() < 0.5, "{towards_rad}: {error_rad}");
             let alike: f32 = straight.descriptor.iter().zip(&turned.descriptor).map(|(a, b)| a * b).sum();
             assert!(alike > 0.95, "{towards_rad}: {alike}");
         }
@@ -136,14 +139,30 @@ mod tests {
 
     #[test]
     fn points_of_a_panorama_are_those_of_the_turned_one_shifted() {
-        let pixels = blob(WIDE_COLUMNS, WIDE_ROWS, [8.0, 60.0], 5.0, 2.0);
-        let there = Panorama::from_wide(pixels);
-        let turned = there.rolled(8 * 40);
-        let (a, b) = (describe_panorama(&there), describe_panorama(&turned));
-        assert!(!a.is_empty() && a.len() == b.len());
-        for (a, b) in a.iter().zip(&b) {
-            assert!((a.x_px + 160.0 - b.x_px).rem_euclid(WIDE_COLUMNS as f64) < 1e-6);
-            assert!(a.descriptor.iter().zip(&b.descriptor).all(|(a, b)| (a - b).abs() < 1e-4));
+        let spots = [[3.3, 40.6, 3.0], [120.7, 60.2, 4.0], [250.4, 80.9, 5.0], [505.6, 70.3, 6.0]];
+        let pixel = |i: usize| {
+            let (x, y) = ((i % WIDE_COLUMNS) as f64, (i / WIDE_COLUMNS) as f64);
+            let of_spot = |[at_x, at_y, radius_px]: [f64; 3]| {
+                let half = WIDE_COLUMNS as f64 / 2.0;
+                let dx = (x - at_x + half).rem_euclid(2.0 * half) - half;
+                (-0.5 * (dx * dx + (y - at_y).powi(2)) / (radius_px * radius_px)).exp()
+            };
+            (50.0 + 150.0 * spots.into_iter().map(of_spot).sum::<f64>()) as f32
+        };
+        let there = Panorama::from_wide((0..WIDE_COLUMNS * WIDE_ROWS).map(pixel).collect());
+        let sorted = |panorama: &Panorama, shift_px: f64| {
+            let mut points = describe_panorama(panorama);
+            let width = WIDE_COLUMNS as f64;
+            points.iter_mut().for_each(|point| point.x_px = (point.x_px + shift_px + 1.0).rem_euclid(width));
+            points.sort_by(|a, b| a.x_px.total_cmp(&b.x_px));
+            points
+        };
+        // 8 · 40 columns of the sampled panorama are 160 of this one.
+        let (before, after) = (sorted(&there, 160.0), sorted(&there.rolled(8 * 40), 0.0));
+        assert!(before.len() >= spots.len() && before.len() == after.len(), "{} {}", before.len(), after.len());
+        for (a, b) in before.iter().zip(&after) {
+            assert!((a.x_px - b.x_px).abs() < 1e-3 && (a.y_px - b.y_px).abs() < 1e-3, "{a:?} {b:?}");
+            assert!((a.scale_px - b.scale_px).abs() < 1e-3, "{a:?} {b:?}");
         }
     }
 
