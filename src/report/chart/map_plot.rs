@@ -5,6 +5,7 @@ use super::picture::{Rgba, png_address};
 use super::plot::{Axis, LABEL, LegendItem, Plot, Spec, TICK};
 use super::scale::Scale;
 use super::svg::{Anchor, Paint};
+use super::text::width_px as width_of;
 use crate::map::CandidateCells;
 use crate::types::{PositionCovariance, PositionM};
 
@@ -44,7 +45,11 @@ const MAX_HEIGHT_PX: f64 = 560.0;
 
 /// A plot of `extent`, with equal scales.
 pub fn map_plot(title: impl Into<String>, extent: Extent, legend: Vec<LegendItem>, width_px: f64) -> Plot {
-    // As wide as the axis labels leave it; the plot then says how wide that is.
+    // Room for the labels of any number of ticks, also of an extent that is made somewhat larger below: the size of the
+    // area must not depend on them.
+    let labels = (3..=8).flat_map(|wanted| Scale::linear(extent.low_m[1], extent.high_m[1]).ticks(wanted));
+    let widest_px = labels.map(|tick| width_of(&tick.label, TICK.size_px, false)).fold(0.0, f64::max);
+    let left_px = widest_px + 18.0;
     let build = |extent: Extent, height_px: f64| {
         let x = Axis::new("east [m]", Scale::linear(extent.low_m[0], extent.high_m[0]));
         let y = Axis::new("north [m]", Scale::linear(extent.low_m[1], extent.high_m[1]));
@@ -52,6 +57,7 @@ pub fn map_plot(title: impl Into<String>, extent: Extent, legend: Vec<LegendItem
         spec.width_px = width_px;
         spec.area_height_px = height_px;
         spec.grid = false;
+        spec.left_px = Some(left_px);
         spec
     };
     let size_m = [0, 1].map(|axis: usize| extent.high_m[axis] - extent.low_m[axis]);
@@ -121,7 +127,7 @@ impl Plot {
         let mut free_from = left;
         for tick in scale.ticks(5) {
             let at = scale.px(tick.value);
-            let half = 0.5 * super::text::width_px(&tick.label, TICK.size_px, false);
+            let half = 0.5 * width_of(&tick.label, TICK.size_px, false);
             let x = at.clamp(left + half, left + wide - half);
             self.above.line([at, top + 9.0], [at, top + 12.0], Paint::stroke(MUTED, 1.0));
             if x - half >= free_from {

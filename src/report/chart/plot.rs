@@ -82,6 +82,8 @@ pub struct Spec {
     pub legend: Vec<LegendItem>,
     /// Lines across the area at the ticks.
     pub grid: bool,
+    /// Room for the labels on the left, where it is not to depend on them \[px\].
+    pub left_px: Option<f64>,
 }
 
 impl Spec {
@@ -94,6 +96,7 @@ impl Spec {
             y,
             legend: Vec::new(),
             grid: true,
+            left_px: None,
         }
     }
 }
@@ -121,10 +124,10 @@ const AXIS_LABEL_PX: f64 = 18.0;
 
 impl Plot {
     pub fn new(spec: Spec) -> Self {
-        let Spec { title, width_px: width, area_height_px, x, y, legend, grid } = spec;
+        let Spec { title, width_px: width, area_height_px, x, y, legend, grid, left_px } = spec;
         let y_ticks = y.ticks((area_height_px / 40.0).clamp(3.0, 8.0) as usize);
         let widest = y_ticks.iter().map(|tick| width_px(&tick.label, TICK.size_px, false)).fold(0.0, f64::max);
-        let left = (widest + 10.0).max(14.0);
+        let left = left_px.unwrap_or((widest + 10.0).max(14.0));
         let right = 12.0;
         let mut below = Shapes::default();
         below.text([0.0, 14.0], &fitted(&title, TITLE.size_px, true, width), TITLE);
