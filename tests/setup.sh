@@ -51,3 +51,33 @@ ready_libclang() {
         install_packages libclang1-14 libclang-common-14-dev || install_packages libclang-dev
     fi
 }
+
+# Where large things that are the same for every run are kept.
+omniloc_cache() { echo "${OMNILOC_CACHE:-${XDG_CACHE_HOME:-$HOME/.cache}/omniloc}"; }
+
+# QEMU's ARM machines and its disk images. Debian 12's own QEMU is older than its qemu-utils may be: both come from the
+# backports, which apt is told of for this one installation.
+ready_qemu_machine() {
+    command -v qemu-system-aarch64 >/dev/null && command -v qemu-img >/dev/null && return
+    if [ "$(. /etc/os-release && echo "${VERSION_CODENAME:-}")" != bookworm ] || [ "$(id -u)" -ne 0 ]; then
+        install_packages qemu-system-arm qemu-utils
+        return
+    fi
+    apt_folder=$(mktemp -d)
+    mkdir -p "$apt_folder/lists/partial"
+    # From where this machine has Debian itself.
+    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' 'Codename: bookworm' | head -n 1)
+    [ -n "$mirror" ] || give_up "apt knows no source of Debian 12: run apt-get update"
+    {
+        cat /etc/apt/sources.list 2>/dev/null || true
+        echo "deb $mirror bookworm-backports main"
+    } >"$apt_folder/sources.list"
+    cat >"$apt_folder/apt.conf" <<CONFIGURATION
+Dir::State::lists "$apt_folder/lists";
+Dir::Etc::sourcelist "$apt_folder/sources.list";
+CONFIGURATION
+    APT_CONFIG=$apt_folder/apt.conf apt-get update --quiet >&2
+    APT_CONFIG=$apt_folder/apt.conf DEBIAN_FRONTEND=noninteractive apt-get install --yes --quiet --no-install-recommends \
+        --target-release bookworm-backports qemu-system-arm qemu-utils >&2
+    rm -rf "$apt_folder"
+}

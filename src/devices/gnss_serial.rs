@@ -19,6 +19,7 @@ use std::{
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     fs::{Mode, OFlags},
+    io::Errno,
     termios::{ControlModes, OptionalActions, isatty, tcgetattr, tcsetattr},
 };
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
@@ -255,7 +256,7 @@ impl Line for Tty {
         // Without IN it is a hang-up or an error, which `read` puts into words.
         match rustix::io::read(fd, buffer) {
             Ok(count) => Ok(Some(count)),
-            Err(rustix::io::Errno::INTR | rustix::io::Errno::AGAIN) => Ok(None),
+            Err(Errno::INTR | Errno::AGAIN) => Ok(None),
             Err(error) => Err(error.into()),
         }
     }
@@ -274,15 +275,19 @@ fn open_error(path: &Path, device: String, error: serialport::Error) -> DeviceEr
         ErrorKind::InvalidInput => DeviceError::Unsupported { device, what: error.description },
         // Unplugged between a look at the path and its opening.
         _ if !path.exists() => DeviceError::NotPresent { device },
-        _ if !is_terminal(path) => DeviceError::Unsupported { device, what: "it is no serial port".to_owned() },
-        _ => DeviceError::Io { device, source: io::Error::other(error.description) },
+        _ => match is_terminal(path) {
+            // So refuses a sandbox; serialport has no word for it.
+            Err(Errno::PERM) => not_permitted(path, device),
+            Ok(true) => DeviceError::Io { device, source: io::Error::other(error.description) },
+            Ok(false) | Err(_) => DeviceError::Unsupported { device, what: "it is no serial port".to_owned() },
+        },
     }
 }
 
 /// Only for the words of an error: opening an Arduino's port once more starts it over.
-fn is_terminal(path: &Path) -> bool {
+fn is_terminal(path: &Path) -> Result<bool, Errno> {
     let flags = OFlags::RDONLY | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-    rustix::fs::open(path, flags, Mode::empty()).is_ok_and(isatty)
+    rustix::fs::open(path, flags, Mode::empty()).map(isatty)
 }
 
 fn not_permitted(path: &Path, device: String) -> DeviceError {
