@@ -34,6 +34,7 @@ use figure::{Drawn, Figure};
 use gallery::{Chosen, Worst};
 use tables::Table;
 
+use crate::gnss::date_of_day;
 use crate::recording::{Recording, RecordingError, write_bytes_atomically};
 
 /// Pixels of a PNG for each of the drawing.
@@ -207,20 +208,10 @@ fn figure_of(drawn: &Drawn) -> Option<&Figure> {
     }
 }
 
-/// `seconds` since 1970 as date and time, UTC: Howard Hinnant, “chrono-Compatible Low-Level Date Algorithms”,
-/// `civil_from_days`.
+/// `seconds` since 1970 as date and time, UTC.
 pub fn utc_text(seconds: u64) -> String {
-    let (days, of_day) = ((seconds / 86_400) as i64, seconds % 86_400);
-    let shifted = days + 719_468;
-    let era = shifted.div_euclid(146_097);
-    let day_of_era = shifted.rem_euclid(146_097);
-    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
-    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let month_from_march = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
-    let month = if month_from_march < 10 { month_from_march + 3 } else { month_from_march - 9 };
-    let year = year_of_era + era * 400 + i64::from(month <= 2);
-    format!("{year:04}-{month:02}-{day:02} {:02}:{:02} UTC", of_day / 3600, of_day / 60 % 60)
+    let (year, month, day) = date_of_day((seconds / 86_400) as i64);
+    format!("{year:04}-{month:02}-{day:02} {:02}:{:02} UTC", seconds / 3600 % 24, seconds / 60 % 60)
 }
 
 #[cfg(test)]
