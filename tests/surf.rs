@@ -89,7 +89,7 @@ impl Matches {
         self.exact += usize::from(away(other) <= 0.1);
         if wrap_angle_rad(point.orientation_rad - other.orientation).abs() < PI / 18.0 {
             self.turned_alike += 1;
-            if (2.0 * other.scale + 0.5) as usize % 2 == 0 {
+            if ((2.0 * other.scale + 0.5) as usize).is_multiple_of(2) {
                 self.correlations.push(correlation(point, other));
             }
         }
