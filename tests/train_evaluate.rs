@@ -270,7 +270,7 @@ fn held_positions_still_make_a_map() {
 }
 
 #[test]
-fn no_output_may_be_an_input() {
+fn no_output_may_be_an_input_and_arguments_that_contradict_are_refused() {
     let folder = folder();
     let recording = recording(&folder, 16);
     let before = fs::read(&recording).expect("readable");
@@ -286,6 +286,8 @@ fn no_output_may_be_an_input() {
         vec!["train", path, "--out", "x.map", "--within-m", "-1"],
         vec!["evaluate", path, "--json", "/dev/null"],
         vec!["evaluate", path, "--map", "x.map", "--seeds", "2"],
+        vec!["evaluate", path, "--split", "random,random"],
+        vec!["evaluate", path, "--seed", "18446744073709551615", "--seeds", "2"],
     ] {
         let (code, _, stderr) = run(omniloc().args(&arguments).current_dir(folder.path()));
         assert_eq!(code, 2, "{arguments:?}: {stderr}");

@@ -313,8 +313,24 @@ fn moved_to(map: &FeatureMap, path: &Path, mut recording: Recording) -> anyhow::
 }
 
 /// The recordings that a map was made of.
+/// As it was typed; what is no UTF-8 is replaced, to be shown.
+pub fn command_line() -> Vec<String> {
+    std::env::args_os().map(|argument| argument.to_string_lossy().into_owned()).collect()
+}
+
 fn open_surveys(args: &Args, path: &Path, map: &FeatureMap) -> anyhow::Result<Vec<Recording>> {
     let recordings = open_recordings(&args.survey, None)?;
+    for recording in &recordings {
+        if !map.info.recordings.iter().any(|learned| learned.name == recording.name) {
+            let of: Vec<&str> = map.info.recordings.iter().map(|learned| learned.name.as_str()).collect();
+            eprintln!(
+                "warning: {} was learned from {}, not from --survey {}: the baselines learn from another drive",
+                path.display(),
+                of.join(", "),
+                recording.name
+            );
+        }
+    }
     let frames: usize = recordings.iter().map(|recording| recording.survey.len()).sum();
     if frames != map.positions_m.len() {
         eprintln!(
@@ -426,7 +442,16 @@ fn protocol(
 /// Splits, seeds and variants, in the order of the table.
 fn cases(args: &Args, survey: &Survey) -> anyhow::Result<Vec<Case>> {
     let mut cases = Vec::new();
-    for name in &args.split {
+    let end = args.seed.checked_add(args.seeds).ok_or_else(|| {
+        BadArgument(format!(
+            "--seed {}: there are no {} seeds from there on; name a smaller one",
+            args.seed, args.seeds
+        ))
+    })?;
+    for (number, name) in args.split.iter().enumerate() {
+        if args.split[..number].contains(name) {
+            return Err(BadArgument(format!("--split {name}: is named twice; the same split is no second one")).into());
+        }
         let kind = match name.as_str() {
             "random" => SplitKind::Random,
             "blocked" => SplitKind::Blocked,
@@ -442,7 +467,7 @@ fn cases(args: &Args, survey: &Survey) -> anyhow::Result<Vec<Case>> {
         };
         let variants: &[Variant] = if kind == SplitKind::Random { &args.variants } else { &[Variant::Plain] };
         for &variant in variants {
-            for seed in args.seed..args.seed + args.seeds {
+            for seed in args.seed..end {
                 let split = Split::new(kind, survey.len(), seed);
                 cases.push(Case { split_name: name.clone(), split, seed: Some(seed), variant });
             }
@@ -459,7 +484,7 @@ fn truth(args: &Args, survey: &Survey) -> anyhow::Result<Vec<PositionM>> {
 }
 
 fn write_json(path: &Path, args: &Args, mut evaluation: Evaluation) -> anyhow::Result<()> {
-    let command: Vec<String> = std::env::args().collect();
+    let command = command_line();
     let datasets: Vec<String> = args.recordings.iter().map(|path| path.display().to_string()).collect();
     if !args.frames {
         evaluation.entries.iter_mut().for_each(|entry| entry.frames = None);

@@ -95,17 +95,15 @@ pub fn check_output(out: &Path, kind: OutputKind, force: bool) -> Result<(), Bad
     match (is_kind, force) {
         (true, true) => match foreign_entry(out) {
             Some(name) if kind == OutputKind::Folder => Err(BadArgument(format!(
-                "--out {}: holds {name}, which is no output of this command; choose another name",
+                "{}: holds {name}, which is no output of this command; choose another name",
                 out.display()
             ))),
             _ => Ok(()),
         },
-        (true, false) => {
-            Err(BadArgument(format!("--out {}: exists already; give --force to replace it", out.display())))
-        }
+        (true, false) => Err(BadArgument(format!("{}: exists already; give --force to replace it", out.display()))),
         (false, _) => {
             let expected = if kind == OutputKind::File { "a regular file" } else { "a folder" };
-            Err(BadArgument(format!("--out {}: exists and is not {expected}; choose another name", out.display())))
+            Err(BadArgument(format!("{}: exists and is not {expected}; choose another name", out.display())))
         }
     }
 }

@@ -83,7 +83,7 @@ impl Reporter {
         let report = Report {
             program: env!("CARGO_PKG_VERSION").into(),
             made: utc_text(now_s),
-            command: std::env::args().collect(),
+            command: super::evaluate::command_line(),
             settings: self.settings,
             datasets: self.datasets,
         };

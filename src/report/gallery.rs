@@ -43,6 +43,8 @@ pub struct Neighbour {
 #[derive(Debug, Clone)]
 pub struct Chosen {
     pub method: String,
+    /// The split whose test frames they are; `None` against a map.
+    pub split: Option<String>,
     pub frames: Vec<FrameError>,
     /// Learning frames: recording and row, position.
     learning: Vec<Vec<((usize, usize), PositionM)>>,
@@ -86,7 +88,7 @@ pub fn choose(dataset: &Dataset, surveys: &[Recording]) -> Option<Chosen> {
         rows.map(|&row| ((0, row), dataset.frames[row].position_m)).collect()
     };
     let learning = errors.iter().map(learning_of).collect();
-    Some(Chosen { method: method.label.clone(), frames: errors, learning })
+    Some(Chosen { method: method.label.clone(), split, frames: errors, learning })
 }
 
 /// Reads the images of what was chosen, and of the frame at `shown_row`.
@@ -161,9 +163,10 @@ pub fn photographs(recording: &Recording, rows: &BTreeSet<usize>) -> Result<BTre
 /// The gallery as HTML.
 pub fn html(dataset: &Dataset, chosen: &Chosen, worst: &[Worst]) -> String {
     let mut html = format!(
-        "<p>The largest errors of <b>{}</b>, each frame once. Panoramas begin to the east where the yaw is known, so that \
+        "<p>The largest errors of <b>{}</b>{}, each frame once. Panoramas begin to the east where the yaw is known, so that \
          those of one place look alike.</p><div class=\"gallery\">",
-        escaped(&chosen.method)
+        escaped(&chosen.method),
+        chosen.split.as_ref().map(|split| format!(" in the {} split", escaped(split))).unwrap_or_default()
     );
     for one in worst {
         let seed = one.frame.seed.map(|seed| format!(", seed {seed}")).unwrap_or_default();
@@ -262,5 +265,5 @@ pub fn json(chosen: &Chosen, worst: &[Worst]) -> Value {
             "learning_image_at_the_answer": near(&one.at_answer),
         })
     });
-    json!({"method": chosen.method, "frames": frames.collect::<Vec<_>>()})
+    json!({"method": chosen.method, "split": chosen.split, "frames": frames.collect::<Vec<_>>()})
 }

@@ -68,6 +68,12 @@ impl<'a> Method<'a> {
         Self { label, color, dashes, kind, entries: Vec::new() }
     }
 
+    /// Whether its answers are labels, which are right where they are named rightly, and no positions (Do et al. 2015, eq.
+    /// 15): errors of these are not to be compared with those of the others.
+    pub fn answers_labels(&self) -> bool {
+        matches!(self.entries[0].features.as_str(), "bow" | "bow-surf")
+    }
+
     /// What an entry's method is called.
     pub fn name_of(entry: &Entry) -> String {
         Method::of(entry).label

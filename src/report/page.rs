@@ -124,6 +124,7 @@ fn in_words(method: &Method, all: &[Method], case: &str) -> String {
     let _ = write!(text, "an RMSE of {} m with the {}", rmse(method), method.label);
     let others = all.iter().filter(|other| {
         other.label != method.label
+            && !other.answers_labels()
             && matches!(other.kind, Kind::Whole | Kind::Nothing | Kind::Baseline)
             && other.mean(|e| e.rmse_m).is_some()
     });

@@ -109,7 +109,8 @@ pub fn with_family_wise_p(mut comparisons: Vec<Comparison>) -> Vec<Comparison> {
     for (rank, &i) in order.iter().enumerate() {
         at_least = at_least.max((order.len() - rank) as f64 * comparisons[i].p).min(1.0);
         comparisons[i].p_holm = at_least;
-        comparisons[i].is_real = at_least < SIGNIFICANT;
+        let Estimate { low, high, .. } = comparisons[i].mean_difference_m;
+        comparisons[i].is_real = at_least < SIGNIFICANT && (low > 0.0 || high < 0.0);
     }
     comparisons
 }
@@ -147,7 +148,7 @@ mod tests {
 
     #[test]
     fn holm_s_adjustment_equals_a_hand_computed_one() {
-        let unknown = Estimate { value: 0.0, low: 0.0, high: 0.0 };
+        let unknown = Estimate { value: 1.0, low: 0.5, high: 1.5 };
         let method = Method { recipe: None, features: String::new(), estimator: "single" };
         let comparison = |p: f64| Comparison {
             section: Section { dataset: String::new(), split: None, noisy: false, fixed: false },
@@ -168,5 +169,8 @@ mod tests {
             assert!((found - expected).abs() < 1e-12, "{found} {expected}");
         }
         assert_eq!(adjusted.iter().map(|c| c.is_real).collect::<Vec<_>>(), [false, true, false, false]);
+        // Seeds that disagree leave it open.
+        let open = Comparison { mean_difference_m: Estimate { low: -0.1, ..unknown }, ..comparison(0.01) };
+        assert!(!with_family_wise_p(vec![open])[0].is_real);
     }
 }

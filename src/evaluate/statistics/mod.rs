@@ -124,7 +124,8 @@ pub struct Comparison {
     pub p: f64,
     /// The same for the family of all comparisons of the section.
     pub p_holm: f64,
-    /// `p_holm` is less than [`SIGNIFICANT`].
+    /// `p_holm` is less than [`SIGNIFICANT`], and the interval of the mean difference, which seeds have a part in, does not
+    /// hold 0.
     pub is_real: bool,
 }
 

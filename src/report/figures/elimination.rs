@@ -50,7 +50,7 @@ pub fn elimination(dataset: &Dataset) -> Drawn {
     });
     let caption = format!(
         "From all features (left) to none (right). The features are chosen where the validation error (blue) is least; \
-         whether that was worth it shows in the test error (red), on frames that had no part in the choice. Thin: single \
+         whether that was worth it shows in the test error (orange), on frames that had no part in the choice. Thin: single \
          seeds of the {} split; thick: their mean; rings: the number kept.",
         first.split
     );

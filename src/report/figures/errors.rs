@@ -33,7 +33,7 @@ pub fn cases(dataset: &Dataset) -> Vec<(Option<String>, String)> {
 fn methods_of_cases<'a>(dataset: &'a Dataset, shown: impl Fn(&Method) -> bool) -> Vec<(String, Vec<Method<'a>>)> {
     let of_case = |(split, title): (Option<String>, String)| {
         let mut methods = methods(dataset, split.as_deref());
-        methods.retain(|method| shown(method));
+        methods.retain(|method| shown(method) && !method.answers_labels());
         (capitalized(&title), methods)
     };
     cases(dataset).into_iter().map(of_case).filter(|(_, methods)| !methods.is_empty()).collect()

@@ -70,7 +70,10 @@ fn panel(title: &str, all: &[Compared], width_px: f64) -> Panel {
         [-100.0, -10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0, 100.0].into_iter().filter(|v| (low..=high).contains(v));
     let ticks = ticks.map(|v: f64| (squeezed(v), number(v, usize::from(v.abs() < 1.0 && v != 0.0))));
     let margin = 0.04 * (squeezed(high) - squeezed(low));
-    let x = Axis::new("mean error larger by [m]", Scale::linear(squeezed(low) - margin, squeezed(high) + margin));
+    let x = Axis::new(
+        "mean error larger by [m], logarithmic on either side",
+        Scale::linear(squeezed(low) - margin, squeezed(high) + margin),
+    );
     let y = Axis::new("", Scale::linear(0.0, all.len() as f64)).with_ticks([]);
     let mut spec = Spec::new(title, x.with_ticks(ticks.collect::<Vec<_>>()), y);
     spec.width_px = width_px;
