@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use serde_json::json;
 
-use super::options::{OutputKind, check_input, check_not_input, check_output};
+use super::options::{OutputKind, check_input, check_not_input, check_output, command_line};
 use super::progress::Progress;
 use super::reporter::Reporter;
 use super::survey::{
@@ -313,11 +313,6 @@ fn moved_to(map: &FeatureMap, path: &Path, mut recording: Recording) -> anyhow::
 }
 
 /// The recordings that a map was made of.
-/// As it was typed; what is no UTF-8 is replaced, to be shown.
-pub fn command_line() -> Vec<String> {
-    std::env::args_os().map(|argument| argument.to_string_lossy().into_owned()).collect()
-}
-
 fn open_surveys(args: &Args, path: &Path, map: &FeatureMap) -> anyhow::Result<Vec<Recording>> {
     let recordings = open_recordings(&args.survey, None)?;
     for recording in &recordings {

@@ -8,6 +8,11 @@ use std::{
 use super::BadArgument;
 use crate::types::Geodetic;
 
+/// The command as it was typed; what is no UTF-8 is replaced, to be shown.
+pub fn command_line() -> Vec<String> {
+    std::env::args_os().map(|argument| argument.to_string_lossy().into_owned()).collect()
+}
+
 /// `LAT,LON` or `LAT,LON,ALT`: degrees and metres above the ellipsoid.
 pub fn parse_origin(text: &str) -> Result<Geodetic, String> {
     let expected = "expected LAT,LON or LAT,LON,ALT in degrees (±90, ±180) and metres, such as 40.82,-73.9";

@@ -8,6 +8,7 @@ use anyhow::Context;
 use sha2::{Digest, Sha256};
 
 use super::BadArgument;
+use super::options::command_line;
 use super::progress::Progress;
 use crate::evaluate::{Case, Evaluation};
 use crate::map::FeatureMap;
@@ -83,7 +84,7 @@ impl Reporter {
         let report = Report {
             program: env!("CARGO_PKG_VERSION").into(),
             made: utc_text(now_s),
-            command: super::evaluate::command_line(),
+            command: command_line(),
             settings: self.settings,
             datasets: self.datasets,
         };

@@ -192,11 +192,9 @@ impl MapInfo {
     /// One standard deviation, on either axis, of the positions that the map was learned from, as far as smoothing knows
     /// it; 0 where they were taken as they are \[m\].
     pub fn position_std_m(&self) -> f64 {
-        let known = |recording: &TrainedOn| match recording.track {
-            Some(TrackReport::Smoothed { remaining_std_m, .. }) => {
-                Some((recording.frames as f64, remaining_std_m * remaining_std_m))
-            }
-            _ => None,
+        let known = |recording: &TrainedOn| {
+            let remaining_std_m = recording.track?.remaining_std_m()?;
+            Some((recording.frames as f64, remaining_std_m * remaining_std_m))
         };
         let (frames, sum_m2) = (self.recordings.iter().filter_map(known))
             .fold((0.0, 0.0), |(n, sum), (frames, variance_m2)| (n + frames, sum + frames * variance_m2));
