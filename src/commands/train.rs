@@ -44,8 +44,7 @@ pub struct Args {
     pub even_if_worse: bool,
     #[arg(long, value_enum, default_value = "default")]
     pub recipe: RecipeName,
-    /// Feature types, in place of the recipe's own: fft, hist, hist-sqrt, sp, sp-log, sp-energy, gradient,
-    /// patches, patch-words
+    /// Feature types, in place of the recipe's own: fft, hist, sp, gradient, patches, patch-words
     #[arg(long, value_delimiter = ',', value_parser = parse_descriptor)]
     pub features: Vec<Descriptor>,
     /// How features are chosen [default: backward for the paper's recipe, none for the default one]

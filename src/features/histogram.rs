@@ -1,4 +1,4 @@
-//! Gray-level histogram: `hist`, 156 properties, and its square-root form `hist-sqrt`.
+//! Gray-level histogram: `hist`, 156 properties.
 
 use crate::panorama::Panorama;
 
@@ -15,13 +15,6 @@ pub fn describe(panorama: &Panorama, properties: &mut [f32]) {
     for (property, count) in properties.iter_mut().zip(counts) {
         *property = count as f32;
     }
-}
-
-/// √y_k: the Hellinger map, under which the distance of two histograms is not ruled by their fullest bins (Arandjelović
-/// & Zisserman 2012).
-pub fn describe_sqrt(panorama: &Panorama, properties: &mut [f32]) {
-    describe(panorama, properties);
-    properties.iter_mut().for_each(|count| *count = count.sqrt());
 }
 
 #[cfg(test)]

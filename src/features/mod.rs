@@ -24,7 +24,7 @@ use gradient::GradientSignature;
 pub use gradient::{COMPASS_BYTES, COMPASS_HARMONICS};
 pub use patches::{COEFFICIENTS as PATCH_COEFFICIENTS, Patch};
 use patches::{KernelMean, Patches};
-use steerable::{Response, SteerablePyramid};
+use steerable::SteerablePyramid;
 use words::PatchWords;
 
 /// A kind of image properties.
@@ -35,14 +35,8 @@ pub enum Descriptor {
     Fft,
     /// Gray histogram: the paper's Histogram.
     Hist,
-    /// √ of the histogram.
-    HistSqrt,
     /// Steerable pyramid: the paper's SP.
     Sp,
-    /// Logarithm of [`Descriptor::Sp`].
-    SpLog,
-    /// Local energy of the steerable pyramid.
-    SpEnergy,
     /// Fourier signature of gradient orientations.
     Gradient,
     /// Kernel mean of the patches all around.
@@ -52,13 +46,10 @@ pub enum Descriptor {
 }
 
 impl Descriptor {
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 6] = [
         Self::Fft,
         Self::Hist,
-        Self::HistSqrt,
         Self::Sp,
-        Self::SpLog,
-        Self::SpEnergy,
         Self::Gradient,
         Self::Patches,
         Self::PatchWords,
@@ -70,8 +61,8 @@ impl Descriptor {
     pub fn dimensions(self) -> usize {
         match self {
             Self::Fft => fft::DIMENSIONS,
-            Self::Hist | Self::HistSqrt => histogram::DIMENSIONS,
-            Self::Sp | Self::SpLog | Self::SpEnergy => steerable::DIMENSIONS,
+            Self::Hist => histogram::DIMENSIONS,
+            Self::Sp => steerable::DIMENSIONS,
             Self::Gradient => gradient::DIMENSIONS,
             Self::Patches => patches::DIMENSIONS,
             Self::PatchWords => words::DIMENSIONS,
@@ -83,10 +74,7 @@ impl Descriptor {
         match self {
             Self::Fft => "fft",
             Self::Hist => "hist",
-            Self::HistSqrt => "hist-sqrt",
             Self::Sp => "sp",
-            Self::SpLog => "sp-log",
-            Self::SpEnergy => "sp-energy",
             Self::Gradient => "gradient",
             Self::Patches => "patches",
             Self::PatchWords => "patch-words",
@@ -177,10 +165,7 @@ impl Describer {
             match descriptor {
                 Descriptor::Fft => self.fft.describe(panorama, properties),
                 Descriptor::Hist => histogram::describe(panorama, properties),
-                Descriptor::HistSqrt => histogram::describe_sqrt(panorama, properties),
-                Descriptor::Sp => self.pyramid.describe(panorama, Response::Magnitude, properties),
-                Descriptor::SpLog => self.pyramid.describe(panorama, Response::LogMagnitude, properties),
-                Descriptor::SpEnergy => self.pyramid.describe(panorama, Response::Energy, properties),
+                Descriptor::Sp => self.pyramid.describe(panorama, properties),
                 Descriptor::Gradient => self.gradient.describe(properties),
                 Descriptor::Patches => self.kernel_mean.describe(self.patches.all(), properties),
                 Descriptor::PatchWords => self.words.describe(self.patches.all(), properties),

@@ -1,4 +1,4 @@
-//! Steerable pyramid: `sp`, 72 properties, and the forms `sp-log` and `sp-energy`.
+//! Steerable pyramid: `sp`, 72 properties.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::ops::Range;
@@ -17,20 +17,9 @@ pub const DIMENSIONS: usize = SCALES * ORIENTATIONS * ZONES;
 /// Numbers added, or rows transposed, at a time: a divisor of every band's size.
 const LANES: usize = 8;
 
-/// What is averaged over a zone of a band.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Response {
-    /// |real response|. The signed mean of a band-pass band is zero but for noise, so this is how we read the paper's
-    /// “average filter responses”.
-    Magnitude,
-    /// log(1e-3 + |real response|) of the mean: weak bands count as much as strong ones.
-    LogMagnitude,
-    /// |complex response|: the local energy, free of the phase within the band.
-    Energy,
-}
-
 /// Mean filter responses of the steerable pyramid of Simoncelli & Freeman (1995), 4 scales × 6 orientations, over the
-/// top, middle and bottom third of each band, in the order scale, orientation, zone.
+/// top, middle and bottom third of each band, in the order scale, orientation, zone: the means of |real response|. The
+/// signed mean of a band-pass band is zero but for noise, so this is how we read the paper's “average filter responses”.
 ///
 /// The pyramid is built in the frequency domain, as in `buildSFpyr` of matlabPyrTools and `SteerablePyramidFreq` of
 /// pyrtools. With ω normalized to 1 at the Nyquist frequency of the full image, r = |ω|, θ = arg ω, and
@@ -89,7 +78,7 @@ impl<T: FftNum + Into<f64>> SteerablePyramid<T> {
         }
     }
 
-    pub fn describe(&mut self, panorama: &Panorama, response: Response, properties: &mut [f32]) {
+    pub fn describe(&mut self, panorama: &Panorama, properties: &mut [f32]) {
         for (sample, &value) in self.spectrum.iter_mut().zip(&panorama.gray) {
             // Around mid-gray: no band sees the mean, and small numbers keep their digits.
             *sample = Complex::new(convert(f64::from(value) - 128.0), T::zero());
@@ -98,13 +87,7 @@ impl<T: FftNum + Into<f64>> SteerablePyramid<T> {
         let spectrum = &*self.forward.transform(&mut self.spectrum);
         let of_scales = properties.chunks_exact_mut(ORIENTATIONS * ZONES);
         for (scale, properties) in self.scales.iter_mut().zip(of_scales) {
-            match response {
-                Response::Energy => scale.energies(spectrum, properties),
-                Response::Magnitude | Response::LogMagnitude => scale.magnitudes(spectrum, properties),
-            }
-        }
-        if response == Response::LogMagnitude {
-            properties.iter_mut().for_each(|mean| *mean = libm::logf(mean.max(0.0) + 1e-3));
+            scale.describe(spectrum, properties);
         }
     }
 }
@@ -117,7 +100,7 @@ impl<T: FftNum + Into<f64>> Default for SteerablePyramid<T> {
 
 impl<T: FftNum + Into<f64>> Scale<T> {
     /// Zone means of |real band|, two orientations a transform: band k in the real part, k + 1 in the imaginary part.
-    fn magnitudes(&mut self, spectrum: &[Complex<T>], properties: &mut [f32]) {
+    fn describe(&mut self, spectrum: &[Complex<T>], properties: &mut [f32]) {
         for (pair, properties) in properties.chunks_exact_mut(2 * ZONES).enumerate() {
             let (first, second) = (&self.filters[2 * pair], &self.filters[2 * pair + 1]);
             for (here, full) in halves_of_rows(self.size) {
@@ -128,36 +111,13 @@ impl<T: FftNum + Into<f64>> Scale<T> {
                 }
             }
             let band = self.plane.transform(&mut self.band);
-            let means = zone_means(band, self.size, |value| (value.re.abs(), value.im.abs()));
+            let means = zone_means(band, self.size);
             for (zone, (real, imaginary)) in means.into_iter().enumerate() {
                 properties[zone] = real as f32;
                 properties[ZONES + zone] = imaginary as f32;
             }
         }
     }
-
-    /// Zone means of |complex band|: the analytic signal, from the half plane cos(θ − πk/6) > 0 with weight 2.
-    fn energies(&mut self, spectrum: &[Complex<T>], properties: &mut [f32]) {
-        for (k, properties) in properties.chunks_exact_mut(ZONES).enumerate() {
-            let filter = &self.filters[k];
-            for (here, full) in halves_of_rows(self.size) {
-                let spectrum = spectrum[full].iter().zip(&filter[here.clone()]);
-                for (band, (f, &a)) in self.band[here].iter_mut().zip(spectrum) {
-                    let a = if a.is_negative() { T::zero() } else { a };
-                    *band = f * (a + a);
-                }
-            }
-            let band = self.plane.transform(&mut self.band);
-            let means = zone_means(band, self.size, |value| (magnitude(value), T::zero()));
-            for (property, (energy, _)) in properties.iter_mut().zip(means) {
-                *property = energy as f32;
-            }
-        }
-    }
-}
-
-fn magnitude<T: FftNum + Into<f64>>(value: &Complex<T>) -> T {
-    convert(value.norm_sqr().into().sqrt())
 }
 
 /// The halves of each row of a band of `size`, of frequencies from 0 up and below 0, and where the same frequencies lie
@@ -173,13 +133,9 @@ fn halves_of_rows(size: usize) -> impl Iterator<Item = (Range<usize>, Range<usiz
     })
 }
 
-/// Means of `parts(value)` over the three zones of a band. The mean is over rows
+/// Means of |real part| and |imaginary part| over the three zones of a band. The mean is over rows
 /// \[⌊tH/3⌋, ⌊(t+1)H/3⌋), t = 0, 1, 2, divided by the number of values and by H² for the inverse transform.
-fn zone_means<T: FftNum + Into<f64>>(
-    band: &[Complex<T>],
-    size: usize,
-    parts: impl Fn(&Complex<T>) -> (T, T),
-) -> [(f64, f64); ZONES] {
+fn zone_means<T: FftNum + Into<f64>>(band: &[Complex<T>], size: usize) -> [(f64, f64); ZONES] {
     std::array::from_fn(|t| {
         let (top, bottom) = (t * size / ZONES, (t + 1) * size / ZONES);
         let mut sums = (0.0, 0.0);
@@ -188,9 +144,8 @@ fn zone_means<T: FftNum + Into<f64>>(
             let mut lanes = [(T::zero(), T::zero()); LANES];
             for values in row.as_chunks::<LANES>().0 {
                 for ((first, second), value) in lanes.iter_mut().zip(values) {
-                    let (a, b) = parts(value);
-                    *first = *first + a;
-                    *second = *second + b;
+                    *first = *first + value.re.abs();
+                    *second = *second + value.im.abs();
                 }
             }
             for (first, second) in lanes {
@@ -275,25 +230,19 @@ mod tests {
     use super::*;
     use crate::golden::{assert_close, golden, golden_panorama, list};
 
-    fn describe<T: FftNum + Into<f64>>(panorama: &Panorama, response: Response) -> Vec<f32> {
+    fn describe<T: FftNum + Into<f64>>(panorama: &Panorama) -> Vec<f32> {
         let mut properties = vec![0.0; DIMENSIONS];
-        SteerablePyramid::<T>::new().describe(panorama, response, &mut properties);
+        SteerablePyramid::<T>::new().describe(panorama, &mut properties);
         properties
     }
 
     #[test]
     fn equals_the_reference_values() {
-        let panorama = golden_panorama();
-        for (response, ours, pyrtools) in [
-            (Response::Magnitude, "sp72_absreal", "sp72_pyrtools_absreal"),
-            (Response::Energy, "sp72_energy", "sp72_pyrtools_energy"),
-        ] {
-            let exact = describe::<f64>(&panorama, response);
-            assert_close(ours, &exact, &list(&golden()[ours]), 1e-6);
-            assert_close(pyrtools, &exact, &list(&golden()[pyrtools]), 1e-4);
-            let fast = describe::<f32>(&panorama, response);
-            assert_close(ours, &fast, &list(&golden()[ours]), 1e-5);
-        }
+        let (golden, panorama) = (golden(), golden_panorama());
+        let exact = describe::<f64>(&panorama);
+        assert_close("sp72_absreal", &exact, &list(&golden["sp72_absreal"]), 1e-6);
+        assert_close("pyrtools", &exact, &list(&golden["sp72_pyrtools_absreal"]), 1e-4);
+        assert_close("in single precision", &describe::<f32>(&panorama), &list(&golden["sp72_absreal"]), 1e-5);
     }
 
     /// Σ_k G_k² = 1 and L0² (L² H² …) telescopes: the energies of all bands of a scale add up to the ring it covers.
@@ -315,9 +264,7 @@ mod tests {
         // Three columns of the coarsest band, which are 8 of the panorama's each.
         let mut brighter = panorama.rolled(8 * 8 * 3);
         brighter.gray.iter_mut().for_each(|value| *value += 5.0);
-        for (a, b) in
-            describe::<f32>(&panorama, Response::Magnitude).iter().zip(describe::<f32>(&brighter, Response::Magnitude))
-        {
+        for (a, b) in describe::<f32>(&panorama).iter().zip(describe::<f32>(&brighter)) {
             assert!((a - b).abs() < 1e-4 * a, "{a} became {b}");
         }
     }

@@ -188,10 +188,7 @@ pub fn feature_name(name: &str) -> String {
     match name {
         "fft" => "FFT",
         "hist" => "histogram",
-        "hist-sqrt" => "histogram (√)",
         "sp" => "steerable pyramid",
-        "sp-log" => "steerable pyramid (log)",
-        "sp-energy" => "steerable pyramid (energy)",
         "gradient" => "gradients",
         "patch-words" => "patch words",
         "fused" => "all features",
