@@ -206,6 +206,31 @@ fn what_is_drawn_is_what_the_results_say() {
     assert_eq!(dataset["map"]["info"]["recordings"][0]["frames"], 120);
 }
 
+/// Every line of figure 6 leads from a learning image to the test image whose label it carries.
+#[test]
+fn the_words_figure_draws_the_assignment_of_every_image() {
+    let (report, json) = (protocol_report(), json(&protocol_report()));
+    let figures = json["figures"].as_object().expect("figures by name");
+    let (id, figure) = figures.iter().find(|(id, _)| id.ends_with("-words")).expect("the figure of the words");
+    let mut labelled = 0;
+    for panel in figure["data"].as_array().expect("panels") {
+        let list = |key: &str| panel[key].as_array().expect("a list").clone();
+        let counts = |key: &str| panel["counts"][key].as_u64().expect("a number") as usize;
+        let of_panel = list("learning").iter().filter(|frame| !frame["label"].is_null()).count();
+        assert_eq!(counts("learning_labelled"), of_panel);
+        assert_eq!(counts("learning_left_out"), list("learning").len() - of_panel);
+        let right = list("test").iter().filter(|test| test["index"] == test["predicted"]).count();
+        assert_eq!((counts("test_right"), counts("test_wrong")), (right, list("test").len() - right));
+        labelled += of_panel;
+    }
+    let svg = fs::read_to_string(report.join(format!("figures/{id}.svg"))).expect("readable");
+    let lines = svg.matches("stroke-width=\"1.2\"").count();
+    // And one in the legend of every panel.
+    assert_eq!(lines, labelled + figure["data"].as_array().expect("panels").len());
+    // What overlaps hides what is below it, and does not add up.
+    assert!(!svg.contains("opacity"), "{id}");
+}
+
 fn panels_frames(panels: &Value) -> usize {
     panels.as_array().expect("panels").iter().map(|panel| panel["frames"].as_array().expect("frames").len()).sum()
 }
