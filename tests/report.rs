@@ -231,6 +231,27 @@ fn the_words_figure_draws_the_assignment_of_every_image() {
     assert!(!svg.contains("opacity"), "{id}");
 }
 
+/// Every split has its worst frames, the largest errors of the headline method in it.
+#[test]
+fn the_gallery_shows_the_worst_frames_of_every_split() {
+    let (report, json) = (protocol_report(), json(&protocol_report()));
+    let galleries = json["worst_frames"].as_object().expect("by dataset").values().next().expect("a dataset");
+    let galleries = galleries.as_array().expect("one a split");
+    let splits: Vec<_> = galleries.iter().map(|gallery| gallery["split"].as_str().expect("a name")).collect();
+    assert_eq!(splits, ["random", "blocked"]);
+    for gallery in galleries {
+        let number = |value: &Value| value.as_f64().expect("a number");
+        let of_split = |entry: &&Value| entry["split"] == gallery["split"] && entry["recipe"] == "default";
+        let rows = json["datasets"][0]["results"].as_array().expect("a list");
+        let worst = rows.iter().filter(of_split).map(|row| number(&row["emax_test_m"])).fold(0.0, f64::max);
+        let frames = gallery["frames"].as_array().expect("a list");
+        let errors_m: Vec<f64> = frames.iter().map(|frame| number(&frame["error_m"])).collect();
+        assert!(errors_m.len() == 4 && errors_m.is_sorted_by(|a, b| a >= b) && (errors_m[0] - worst).abs() < 1e-9);
+        assert!(frames.iter().all(|frame| frame["nearest_learning_image"]["index"].is_number()));
+    }
+    assert_eq!(page(&report).matches("<article class=\"worst\">").count(), 8);
+}
+
 fn panels_frames(panels: &Value) -> usize {
     panels.as_array().expect("panels").iter().map(|panel| panel["frames"].as_array().expect("frames").len()).sum()
 }

@@ -31,7 +31,7 @@ pub use insight::InsightError;
 
 use chart::picture::{PictureError, rasterized};
 use figure::{Drawn, Figure};
-use gallery::{Chosen, Worst};
+use gallery::Gallery;
 use tables::Table;
 
 use crate::gnss::date_of_day;
@@ -69,7 +69,8 @@ pub enum ReportError {
 struct Part {
     drawn: Vec<Drawn>,
     tables: Vec<Table>,
-    gallery: Option<(Chosen, Vec<Worst>)>,
+    /// One a split.
+    galleries: Vec<Gallery>,
 }
 
 /// What is being done, for a progress display.
@@ -96,14 +97,8 @@ impl Report {
         for (dataset, recording) in self.datasets.iter_mut().zip(recordings) {
             let shown = BTreeSet::from([figures::shown_row(dataset)]);
             dataset.photographs = gallery::photographs(recording, &shown)?;
-            let gallery = match gallery::choose(dataset, surveys) {
-                Some(chosen) => {
-                    let worst = gallery::read(&chosen, dataset, recording, surveys)?;
-                    Some((chosen, worst))
-                }
-                None => None,
-            };
-            parts.push(Part { drawn: figures::all(dataset), tables: tables::all(dataset), gallery });
+            let galleries = gallery::galleries(dataset, recording, surveys)?;
+            parts.push(Part { drawn: figures::all(dataset), tables: tables::all(dataset), galleries });
         }
         let figures_folder = folder.join("figures");
         let make = |folder: &Path| {
@@ -171,9 +166,7 @@ impl Report {
                 }
             }
             part.tables.iter().for_each(|table| _ = tables.insert(table.id.clone(), table.json()));
-            if let Some((chosen, worst)) = &part.gallery {
-                galleries.insert(dataset.id.clone(), gallery::json(chosen, worst));
-            }
+            galleries.insert(dataset.id.clone(), part.galleries.iter().map(gallery::json).collect());
         }
         let datasets = self.datasets.iter().map(|dataset| {
             let facts: Map<String, Value> =

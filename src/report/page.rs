@@ -73,9 +73,9 @@ fn put_dataset(page: &mut String, dataset: &Dataset, part: &Part) {
         put_drawn(page, drawn);
     }
     let _ = write!(page, "<h3 id=\"{}-gallery\">The worst frames</h3>", dataset.id);
-    match &part.gallery {
-        Some((chosen, worst)) if !worst.is_empty() => *page += &gallery::html(dataset, chosen, worst),
-        _ => *page += "<p class=\"left-out\">No frame has an estimate.</p>",
+    part.galleries.iter().for_each(|of_split| *page += &gallery::html(dataset, of_split));
+    if part.galleries.is_empty() {
+        *page += "<p class=\"left-out\">No frame has an estimate.</p>";
     }
     *page += "</section>";
 }
