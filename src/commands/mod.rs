@@ -6,6 +6,7 @@ pub mod completions;
 pub mod demo;
 pub mod doctor;
 pub mod evaluate;
+mod evaluate_map;
 pub mod export;
 pub mod file_kind;
 pub mod frame_source;
