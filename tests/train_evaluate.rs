@@ -149,6 +149,33 @@ fn the_protocol_runs_with_both_recipes_and_a_split_from_a_file() {
     assert!(rows[1]["n_learned_from"] == 18, "the default recipe refits: {}", rows[1]);
 }
 
+/// A drive along its yaw: smoothing moves its positions, and evaluate says how far.
+#[test]
+fn it_is_said_how_far_smoothing_moved_the_positions() {
+    let folder = folder();
+    let (dataset, recording) = (folder.path().join("town"), folder.path().join("town.mcap"));
+    omniloc().args(["simulate", "--world", "town", "--frames", "60", "--size", "320x180", "--out"]).arg(&dataset).assert().success();
+    omniloc().arg("import").arg(&dataset).arg("--out").arg(&recording).assert().success();
+    let results = folder.path().join("results.json");
+    let (code, stdout, stderr) = run(omniloc()
+        .arg("evaluate")
+        .arg(&recording)
+        .args(["--features", "gradient", "--recipe", "default", "--seeds", "2", "--split", "random", "--grid-step-m", "5"])
+        .args(["--variants", "plain", "--baselines", "none", "--json"])
+        .arg(&results));
+    assert_eq!(code, 0, "{stderr}");
+    let said = "positions of town-1-day-1 that the default recipe learned from: moved by smoothing, by ";
+    assert!(stdout.contains(said) && stdout.contains("m (root mean square, over 2 trials), frame "), "{stdout}");
+    let results: serde_json::Value = serde_json::from_slice(&fs::read(results).expect("written")).expect("JSON");
+    let shifts = results["position_shifts"].as_array().expect("a list");
+    assert_eq!(shifts.len(), 2);
+    for shift in shifts {
+        let [rms_m, largest_m] = ["rms_m", "largest_m"].map(|key| shift[key].as_f64().expect(key));
+        assert!(0.0 < rms_m && rms_m < largest_m && shift["frames"] == 45, "{shift}");
+        assert!(shift["track"]["smoothed"]["receiver_std_m"].is_number(), "{shift}");
+    }
+}
+
 #[test]
 fn what_cannot_be_trained_is_refused_and_leaves_nothing() {
     let row = |index: usize, place: &str| format!("{index},{index:04}.jpg,{place},,");

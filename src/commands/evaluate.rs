@@ -11,9 +11,11 @@ use super::options::{OutputKind, check_input, check_not_input, check_output, com
 use super::progress::Progress;
 use super::reporter::Reporter;
 use super::survey::{bad_argument, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_truth};
-use super::{BadArgument, DONE, print};
+use super::{BadArgument, DONE, print, printable};
 use crate::evaluate::baselines::{Baseline, Views};
-use crate::evaluate::{Case, Entry, Evaluation, LEGEND, Protocol, Statistics, Variant, statistics, table};
+use crate::evaluate::{
+    Case, Entry, Evaluation, LEGEND, PositionShift, Protocol, Statistics, Variant, statistics, table,
+};
 use crate::features::Descriptor;
 use crate::map::{Recipe, RecipeName, Selection, Smoothing, SplitKind};
 use crate::recording::{Recording, write_bytes_atomically};
@@ -157,15 +159,17 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         if let Some(reporter) = &mut reporter {
             reporter.take_evaluation(&evaluation);
         }
-        let Evaluation { entries, statistics, assignments } = evaluation;
+        let Evaluation { entries, statistics, assignments, shifts } = evaluation;
         progress.finish();
         print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
         print(&in_words(&entries))?;
+        PositionShift::lines(&shifts).iter().try_for_each(|line| print(&format!("{}\n", printable(line))))?;
         print(&statistics::text(&statistics))?;
         all.entries.extend(entries);
         all.statistics.methods.extend(statistics.methods);
         all.statistics.comparisons.extend(statistics.comparisons);
         all.assignments.extend(assignments);
+        all.shifts.extend(shifts);
     }
     print(&format!("\n{LEGEND}\n{}", statistics::LEGEND))?;
     if let Some(reporter) = reporter {
@@ -319,6 +323,7 @@ fn protocol(
             progress.say(&format!("note: {note}"));
         }
         all.entries.extend(results.entries);
+        all.shifts.extend(results.shifts);
         all.entries.extend(rows.entries);
         all.assignments.extend(rows.assignments);
     }
@@ -376,6 +381,7 @@ fn write_json(path: &Path, args: &Args, mut evaluation: Evaluation) -> anyhow::R
         "datasets": datasets,
         "results": evaluation.entries,
         "statistics": evaluation.statistics,
+        "position_shifts": evaluation.shifts,
     });
     if args.frames {
         object["assignments"] = json!(evaluation.assignments);

@@ -10,7 +10,8 @@ use super::progress::Progress;
 use super::reporter::Reporter;
 use super::survey::{open_recordings, read_to_match, read_truth};
 use crate::evaluate::baselines::{Baseline, BaselineRows};
-use crate::evaluate::{Evaluation, MapComparison, Statistics, map_entries};
+use crate::evaluate::statistics::Section;
+use crate::evaluate::{Evaluation, MapComparison, PositionShift, Statistics, map_entries};
 use crate::map::{FeatureMap, file};
 use crate::recording::Recording;
 use crate::train::Survey;
@@ -64,7 +65,14 @@ pub fn on_map(
     rows.notes.iter().for_each(|note| progress.say(&format!("note: {note}")));
     entries.extend(rows.entries);
     let statistics = Statistics::of(&entries);
-    Ok(Evaluation { entries, statistics, assignments: rows.assignments })
+    let known = learned.iter().map(|recording| {
+        let of_frames = recording.survey.iter().map(|frame| (frame.index, frame.position_m));
+        let (indices, positions_m): (Vec<_>, Vec<_>) = of_frames.unzip();
+        (recording.name.as_str(), indices, positions_m)
+    });
+    let section = Section { dataset: recording.name.clone(), split: None, noisy: false, fixed: false };
+    let shifts = PositionShift::of_map(&section, &map.info, &map.positions_m, &known.collect::<Vec<_>>());
+    Ok(Evaluation { entries, statistics, assignments: rows.assignments, shifts })
 }
 
 /// `recording` with its positions counted from the map's origin.

@@ -7,6 +7,7 @@ mod entry;
 mod map_baselines;
 mod protocol;
 mod sequence;
+mod shifts;
 pub mod statistics;
 
 pub use against_map::{AgainstMap, MapOutcome, against_map, map_entries};
@@ -15,6 +16,7 @@ pub use entry::{Entry, FrameEntry, LEGEND, table};
 pub use map_baselines::MapComparison;
 pub use protocol::{Case, CaseResults, Protocol, Variant};
 pub use sequence::{Sequence, SequenceFigures, SequencePose};
+pub use shifts::PositionShift;
 pub use statistics::Statistics;
 
 /// All that an evaluation brings.
@@ -26,4 +28,6 @@ pub struct Evaluation {
     pub statistics: Statistics,
     /// One a bag of words and case.
     pub assignments: Vec<WordAssignment>,
+    /// One a trial, or recording of a map, whose positions were smoothed.
+    pub shifts: Vec<PositionShift>,
 }

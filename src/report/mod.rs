@@ -178,6 +178,7 @@ impl Report {
                 "map": dataset.map.as_ref().map(|map| json!({"file": map.path, "sha256": map.sha256, "info": map.info})),
                 "results": dataset.entries,
                 "statistics": dataset.statistics,
+                "position_shifts": dataset.shifts,
             })
         });
         json!({

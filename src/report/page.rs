@@ -13,6 +13,7 @@ use super::figure::{Drawn, Figure, capitalized};
 use super::figures::{cases, recall_at};
 use super::methods::{Kind, Method, headline, methods};
 use super::{Part, gallery};
+use crate::evaluate::PositionShift;
 use crate::map::Selection;
 
 const STYLE: &str = include_str!("page.css");
@@ -212,6 +213,7 @@ fn put_provenance(page: &mut String, report: &Report) {
     for dataset in &report.datasets {
         let _ = write!(page, "<h3>{}</h3>", escaped(&dataset.name));
         put_facts(page, &facts_of(&dataset.provenance));
+        put_shifts(page, dataset);
         if let Some(map) = &dataset.map {
             let info = &map.info;
             let recordings = info.recordings.iter().map(|r| format!("{} ({} frames)", r.name, r.frames));
@@ -250,6 +252,21 @@ fn put_provenance(page: &mut String, report: &Report) {
     *page += "<h3>Settings</h3>";
     put_facts(page, &report.settings.iter().map(|(key, value)| (key.as_str(), value.clone())).collect::<Vec<_>>());
     let _ = write!(page, "<h4>To repeat it</h4><pre>{}</pre></section>", escaped(&report.command_line()));
+}
+
+/// How far positions were moved before anything was learned at them.
+fn put_shifts(page: &mut String, dataset: &Dataset) {
+    let lines = PositionShift::lines(&dataset.shifts);
+    if lines.is_empty() {
+        return;
+    }
+    *page += "<h4>Positions that were learned from</h4>";
+    for line in lines {
+        let _ = write!(page, "<p>{}.</p>", escaped(&capitalized(&line)));
+    }
+    *page += "<p class=\"note\">Smoothing corrects what the receiver said by how a vehicle moves and by places seen more than \
+              once; errors are measured against the positions as they were recorded, or against --truth. Of every trial: \
+              <code>position_shifts</code> in report.json.</p>";
 }
 
 pub fn facts_of(facts: &Provenance) -> Vec<(&'static str, String)> {
