@@ -289,6 +289,28 @@ fn a_report_replaces_only_a_report_and_only_when_told() {
     assert!(fs::read(protocol_report().join("index.html")).expect("readable") == before);
 }
 
+/// What cannot be written is said before the work, and nothing is left of it.
+#[test]
+fn a_folder_that_cannot_hold_the_report_is_refused_at_the_start() {
+    let dataset = TinyDataset::new();
+    let recording = dataset.import("rec.mcap");
+    let evaluate = |arguments: &[&str]| {
+        run(omniloc().current_dir(dataset.temporary.path()).arg("evaluate").arg(&recording).args(arguments))
+    };
+    // No folder can be made there, not even by root.
+    let (code, _, stderr) = evaluate(&["--report", "/proc/report"]);
+    assert!(code == 2 && stderr.contains("cannot make this folder") && !stderr.contains("reading"), "{code} {stderr}");
+    let (code, _, stderr) = evaluate(&["--report", "/proc/self"]);
+    assert!(code == 2 && !stderr.contains("reading frames"), "{code} {stderr}");
+    for json in ["there", "there/results.json", "./there/../there/results.json", "there/more/results.json"] {
+        let (code, _, stderr) = evaluate(&["--report", "there", "--json", json]);
+        assert!(code == 2 && stderr.contains("lies in the folder of the report"), "{json}: {code} {stderr}");
+    }
+    // Five frames are too few to learn from: what was begun is taken back.
+    let (code, ..) = evaluate(&["--report", "there"]);
+    assert!(code != 0 && !dataset.path("there").exists(), "{code}");
+}
+
 /// A program of Debian's chromium package.
 fn chromium() -> &'static str {
     let known = ["/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"];

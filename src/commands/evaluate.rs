@@ -7,7 +7,7 @@ use anyhow::Context;
 use serde_json::json;
 
 use super::evaluate_map::on_map;
-use super::options::{OutputKind, check_input, check_not_input, check_output, command_line};
+use super::options::{OutputKind, check_input, check_not_input, check_output, command_line, resolved};
 use super::progress::Progress;
 use super::reporter::Reporter;
 use super::survey::{bad_argument, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_truth};
@@ -137,6 +137,14 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         check_output(json, OutputKind::File, args.force)?;
         let inputs = args.recordings.iter().chain(&args.map).chain(&args.truth).chain(&args.survey);
         check_not_input(json, inputs)?;
+        if let Some(report) = args.report.as_ref().filter(|report| resolved(json).starts_with(resolved(report))) {
+            let (json, report) = (json.display(), report.display());
+            return Err(BadArgument(format!(
+                "--json {json}: lies in the folder of the report, {report}, which holds a report and nothing else; choose \
+                 another name"
+            ))
+            .into());
+        }
         let folder = json.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if !folder.is_dir() {
             return Err(

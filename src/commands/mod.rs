@@ -23,6 +23,8 @@ pub mod record;
 pub mod recover;
 pub mod replay;
 #[cfg(feature = "report")]
+mod report_folder;
+#[cfg(feature = "report")]
 mod reporter;
 #[cfg(not(feature = "report"))]
 #[path = "no_reporter.rs"]
