@@ -57,7 +57,8 @@ pub fn reliability(dataset: &Dataset) -> Drawn {
 }
 
 fn series(dataset: &Dataset) -> Vec<Series<'_>> {
-    use crate::report::chart::color::{BLUE, GREEN, PURPLE, VERMILION};
+    use crate::report::chart::color::{BLUE, VERMILION};
+    use crate::report::methods::{FILTERED, SMOOTHED};
     let of_insights = dataset.insights.iter().map(|insight| {
         let color = if insight.recipe == "paper" { VERMILION } else { BLUE };
         let (label, is_first) = match &insight.split {
@@ -68,8 +69,11 @@ fn series(dataset: &Dataset) -> Vec<Series<'_>> {
         Series { label, paint: if is_first { paint } else { paint.dashed("5 3") }, answers: &insight.frames }
     });
     let of_sequences = dataset.sequences.iter().map(|sequence| {
-        let color = if sequence.estimator == "filtered" { GREEN } else { PURPLE };
-        Series { label: sequence.estimator.into(), paint: Paint::stroke(color, 2.0), answers: &sequence.answers }
+        let paint = match sequence.estimator {
+            "filtered" => Paint::stroke(FILTERED, 2.0).dashed("12 3"),
+            _ => Paint::stroke(SMOOTHED, 2.0).dashed("5 2"),
+        };
+        Series { label: sequence.estimator.into(), paint, answers: &sequence.answers }
     });
     of_insights.chain(of_sequences).filter(|series| series.answers.len() >= MIN_FRAMES).collect()
 }
