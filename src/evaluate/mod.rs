@@ -12,7 +12,7 @@ pub mod statistics;
 
 pub use against_map::{AgainstMap, MapOutcome, against_map, map_entries};
 pub use baselines::WordAssignment;
-pub use entry::{Entry, FrameEntry, LEGEND, table};
+pub use entry::{Entry, FrameEntry, LEGEND, emax_m, table};
 pub use map_baselines::MapComparison;
 pub use protocol::{Case, CaseResults, Protocol, Variant};
 pub use sequence::{Sequence, SequenceFigures, SequencePose};

@@ -3,7 +3,7 @@
 use super::chart::color::{BLACK, BLUE, BROWN, GREEN, MUTED, OLIVE, ORANGE, PURPLE, SKY, VERMILION};
 use super::dataset::Dataset;
 use crate::evaluate::statistics::{self, Comparison, MethodStatistics, Statistics};
-use crate::evaluate::{Entry, FrameEntry};
+use crate::evaluate::{Entry, FrameEntry, emax_m};
 use crate::features::Descriptor;
 use crate::types::PositionM;
 
@@ -126,6 +126,11 @@ impl<'a> Method<'a> {
                 && (section.noisy, section.fixed) == (first.noisy, first.fixed)
                 && (found.recipe, &found.features, found.estimator) == (first.recipe, &first.features, first.estimator)
         })
+    }
+
+    /// Largest error of all seeds \[m\].
+    pub fn emax_m(&self) -> Option<f64> {
+        emax_m(&self.entries)
     }
 
     /// Mean over the seeds.

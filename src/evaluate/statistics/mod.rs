@@ -95,6 +95,8 @@ pub struct MethodStatistics {
     pub mean_m: Estimate,
     pub median_m: Estimate,
     pub p95_m: Estimate,
+    /// The largest error of all seeds.
+    pub emax_m: f64,
     /// 1 − RMSE / RMSE of always answering the median position.
     pub skill: Option<Estimate>,
     /// Share of all test frames with an error up to [`RECALL_M`].
@@ -243,6 +245,7 @@ fn of_method(
         mean_m: estimate(&|f| f.mean_m),
         median_m: estimate(&|f| f.median_m),
         p95_m: estimate(&|f| f.p95_m),
+        emax_m: errors.largest_m(),
         skill,
         recall: std::array::from_fn(|i| estimate(&|f| f.recall[i])),
         rmse_of_seeds_m: seeds().map(|f| f.rmse_m).collect(),
@@ -301,6 +304,7 @@ mod tests {
         let Estimate { value, low, high } = fft.mean_difference_m;
         assert!([value, low, high].iter().all(|difference| (difference - 0.5).abs() < 1e-9), "{fft:?}");
         assert_eq!(fft.closer_share.value, 0.0);
+        assert!((statistics.methods[0].emax_m - 3.0).abs() < 1e-3, "{:?}", statistics.methods[0]);
         let fused = &statistics.methods[1];
         assert!(fused.rmse_m.low < fused.rmse_m.value && fused.rmse_m.value < fused.rmse_m.high, "{fused:?}");
         assert!(fused.skill.expect("there is a median").value > 0.9 && fused.rmse_of_seeds_m.len() == 3);
