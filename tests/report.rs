@@ -333,6 +333,7 @@ fn a_browser_shows_it_without_complaint_on_a_desk_and_on_a_telephone() {
         for found in widths {
             let none = |key: &str| found[key].as_array().expect("a list").is_empty();
             assert!(none("complaints") && none("requests") && none("sticking") && none("lost"), "{found}");
+            assert!(none("silent"), "{found}");
             assert_eq!((&found["wide"], &found["broken"]), (&Value::from(0), &Value::from(0)), "{found}");
             assert!(found["pictures"].as_u64() >= Some(10) && found["figures"].as_u64() >= Some(8), "{found}");
             // Nine pixels are what small print in a newspaper is.

@@ -85,7 +85,8 @@ impl Table {
 
     pub fn html(&self) -> String {
         let mut html = format!(
-            "<div class=\"table\" id=\"{id}\"><h4>{}</h4><div class=\"scroll\"><table><thead>",
+            "<div class=\"table\" id=\"{id}\"><h4>{}</h4><p class=\"hint\">Wider than the screen: swipe it sideways →</p><div \
+             class=\"scroll\" tabindex=\"0\"><table><thead>",
             escaped(&self.title),
             id = self.id
         );

@@ -96,7 +96,7 @@ fn panel(title: &str, all: &[Compared], width_px: f64) -> Panel {
         plot.dot([squeezed(estimate.value), row], 4.0, dot);
         let middle = plot.at([0.0, row + 0.3])[1];
         let left = plot.area_at[0] + 2.0;
-        plot.above.haloed_text([left, middle], &fitted(&one.label, NOTE.size_px, false, width_px - 150.0), NOTE);
+        plot.label([left, middle], &fitted(&one.label, NOTE.size_px, false, width_px - 150.0), NOTE);
         let sign = if estimate.value > 0.0 { "+" } else { "" };
         let p = match one.comparison.p_holm {
             p if p < 0.001 => "p < 0.001".to_owned(),
@@ -104,7 +104,7 @@ fn panel(title: &str, all: &[Compared], width_px: f64) -> Panel {
         };
         let right = plot.area_at[0] + plot.area_size[0];
         let text = format!("{sign}{} m, {p}", meters(estimate.value));
-        plot.above.haloed_text([right, middle], &text, LABEL.anchored(Anchor::End));
+        plot.label([right, middle], &text, LABEL.anchored(Anchor::End));
     }
     plot.finish()
 }
