@@ -11,6 +11,7 @@ use std::{
 
 use common::{TinyDataset, names, omniloc, run};
 use serde_json::Value;
+use sha2::{Digest, Sha256};
 use tempfile::TempDir;
 
 /// A name that wants to be more than text.
@@ -204,6 +205,22 @@ fn what_is_drawn_is_what_the_results_say() {
     let facts = &dataset["facts"];
     assert_eq!(facts["SHA-256"].as_str().expect("a text").len(), 64);
     assert_eq!(dataset["map"]["info"]["recordings"][0]["frames"], 120);
+}
+
+/// Every file that was read is named with its checksum: recording, map, and what the map was learned from.
+#[test]
+fn the_files_that_were_read_are_on_the_page_with_their_checksums() {
+    let (page, json) = (page(&map_report()), json(&map_report()));
+    let inputs = json["inputs"].as_array().expect("a list");
+    let roles: Vec<_> = inputs.iter().map(|input| input["role"].as_str().expect("a text")).collect();
+    assert_eq!(roles, ["recording", "map", "survey"]);
+    for input in inputs {
+        let [file, sha256] = ["file", "sha256"].map(|key| input[key].as_str().expect("a text"));
+        let bytes = fs::read(file).expect("it is still there");
+        let expected: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        assert_eq!(sha256, expected, "{file}");
+        assert!(page.contains(&format!("<td>{file}</td><td><code>{sha256}</code></td>")), "{file}");
+    }
 }
 
 /// Every line of figure 6 leads from a learning image to the test image whose label it carries.

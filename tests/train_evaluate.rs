@@ -351,6 +351,36 @@ fn a_bad_split_or_truth_names_its_line() {
     assert!(code == 1 && stderr.contains("truth.csv: line 3: x_m is `NaN`"), "{stderr}");
 }
 
+#[test]
+fn a_truth_of_another_place_is_warned_about() {
+    let folder = folder();
+    let recording = recording(&folder, 24);
+    let rows = fs::read_to_string(sample().join("positions.csv")).expect("the sample is shipped");
+    for (east_m, is_doubtful) in [(8.0, false), (1200.0, true)] {
+        let lines = rows.lines().skip(1).take(24).map(|line| {
+            let fields: Vec<&str> = line.split(',').collect();
+            format!("{},{},{}\n", fields[0], fields[2].parse::<f64>().expect("a number") + east_m, fields[3])
+        });
+        let truth = folder.path().join("truth.csv");
+        fs::write(&truth, format!("index,x_m,y_m\n{}", lines.collect::<String>())).expect("writes");
+        let results = folder.path().join("results.json");
+        let (code, _, stderr) = run(omniloc()
+            .arg("evaluate")
+            .arg(&recording)
+            .args(["--features", "gradient", "--recipe", "default", "--seeds", "1", "--split", "random", "--grid-step-m", "10"])
+            .args(["--variants", "plain", "--baselines", "none", "--force", "--truth"])
+            .arg(&truth)
+            .arg("--json")
+            .arg(&results));
+        assert_eq!(code, 0, "{stderr}");
+        assert_eq!(stderr.contains("more than 1200.0 m from the recorded ones"), is_doubtful, "{stderr}");
+        let results: serde_json::Value = serde_json::from_slice(&fs::read(results).expect("written")).expect("JSON");
+        assert_eq!(results["warnings"].as_array().expect("a list").len(), usize::from(is_doubtful));
+        let roles: Vec<_> = results["inputs"].as_array().expect("a list").iter().map(|input| &input["role"]).collect();
+        assert_eq!(roles, ["recording", "truth"]);
+    }
+}
+
 /// Set by `tests/run`: a Python with the packages of `tests/python/requirements.txt`.
 #[test]
 fn python_reads_the_map_without_our_code() {

@@ -7,10 +7,13 @@ use anyhow::Context;
 use serde_json::json;
 
 use super::evaluate_map::on_map;
+use super::inputs::inputs;
 use super::options::{OutputKind, check_input, check_not_input, check_output, command_line, resolved};
 use super::progress::Progress;
 use super::reporter::Reporter;
-use super::survey::{bad_argument, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_truth};
+use super::survey::{
+    bad_argument, elsewhere, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_truth,
+};
 use super::{BadArgument, DONE, print, printable};
 use crate::evaluate::baselines::{Baseline, Views};
 use crate::evaluate::{
@@ -159,6 +162,12 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         args.report.as_ref().map(|folder| Reporter::new(folder, args.force, settings(args))).transpose()?;
     let progress = Progress::new();
     let mut all = Evaluation::default();
+    if args.json.is_some() || reporter.is_some() {
+        all.inputs = inputs(args)?;
+    }
+    if let Some(reporter) = &mut reporter {
+        reporter.take_inputs(&all.inputs);
+    }
     for (number, recording) in recordings.iter().enumerate() {
         let evaluation = match &args.map {
             Some(path) => on_map(args, path, recording, reporter.as_mut(), &progress)?,
@@ -167,7 +176,7 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         if let Some(reporter) = &mut reporter {
             reporter.take_evaluation(&evaluation);
         }
-        let Evaluation { entries, statistics, assignments, shifts } = evaluation;
+        let Evaluation { entries, statistics, assignments, shifts, warnings, .. } = evaluation;
         progress.finish();
         print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
         print(&in_words(&entries))?;
@@ -178,6 +187,7 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         all.statistics.comparisons.extend(statistics.comparisons);
         all.assignments.extend(assignments);
         all.shifts.extend(shifts);
+        all.warnings.extend(warnings);
     }
     print(&format!("\n{LEGEND}\n{}", statistics::LEGEND))?;
     if let Some(reporter) = reporter {
@@ -303,9 +313,12 @@ fn protocol(
         baselines: &args.baselines,
     };
     if let Some(reporter) = &mut reporter {
-        reporter.begin(recording, &plain, exact_m.as_ref().unwrap_or(&plain.positions_m()))?;
+        reporter.begin(recording, &plain, exact_m.as_ref().unwrap_or(&plain.positions_m()));
     }
-    let mut all = Evaluation::default();
+    let doubtful = args.truth.as_ref().zip(exact_m.as_ref());
+    let warnings: Vec<String> = doubtful.and_then(|(path, truth_m)| elsewhere(path, truth_m, &plain)).into_iter().collect();
+    warnings.iter().for_each(|warning| eprintln!("warning: {}", printable(warning)));
+    let mut all = Evaluation { warnings, ..Evaluation::default() };
     for case in cases(args, &plain)? {
         let (survey, views) = match (case.variant, &fixed) {
             (Variant::Fixed, Some((survey, views))) => (survey, views),
@@ -387,6 +400,8 @@ fn write_json(path: &Path, args: &Args, mut evaluation: Evaluation) -> anyhow::R
         "program": env!("CARGO_PKG_VERSION"),
         "command": command,
         "datasets": datasets,
+        "inputs": evaluation.inputs,
+        "warnings": evaluation.warnings,
         "results": evaluation.entries,
         "statistics": evaluation.statistics,
         "position_shifts": evaluation.shifts,

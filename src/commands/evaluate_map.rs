@@ -8,14 +8,15 @@ use super::evaluate::{Args, read_views};
 use super::options::check_input;
 use super::progress::Progress;
 use super::reporter::Reporter;
-use super::survey::{open_recordings, read_to_match, read_truth};
+use super::survey::{elsewhere, open_recordings, read_to_match, read_truth};
+use super::printable;
 use crate::evaluate::baselines::{Baseline, BaselineRows};
 use crate::evaluate::statistics::Section;
 use crate::evaluate::{Evaluation, MapComparison, PositionShift, Statistics, map_entries};
 use crate::map::{FeatureMap, file};
 use crate::recording::Recording;
 use crate::train::Survey;
-use crate::types::PositionM;
+use crate::types::{PositionM, counted};
 
 /// Every frame of `recording` against a map.
 pub fn on_map(
@@ -26,8 +27,10 @@ pub fn on_map(
     progress: &Progress,
 ) -> anyhow::Result<Evaluation> {
     let map = open_map(path)?;
+    let mut warnings = Vec::new();
     if map.info.recordings.iter().any(|trained_on| trained_on.name == recording.name) {
-        eprintln!("warning: the map was trained on {}: it knows these frames, and the errors flatter", recording.name);
+        let name = &recording.name;
+        warnings.push(format!("the map was trained on {name}: it knows these frames, and the errors flatter"));
     }
     let descriptors = map.info.groups.iter().map(|group| group.recipe.descriptor).collect();
     let recording = moved_to(&map, path, recording.clone())?;
@@ -36,12 +39,14 @@ pub fn on_map(
         .check_lens(&survey.calibration, survey.image_size_px)
         .with_context(|| format!("{} against {}", recording.path.display(), path.display()))?;
     let truth_m = truth(args, &survey)?;
+    warnings.extend(args.truth.as_ref().and_then(|path| elsewhere(path, &truth_m, &survey)));
     let mut entries = map_entries(&recording.name, &survey, &map, &truth_m);
-    let learned = if args.survey.is_empty() { Vec::new() } else { open_surveys(args, path, &map)? };
+    let learned = if args.survey.is_empty() { Vec::new() } else { open_surveys(args, path, &map, &mut warnings)? };
+    warnings.iter().for_each(|warning| eprintln!("warning: {}", printable(warning)));
     if let Some(reporter) = reporter {
         progress.begin("report: what the map knows", 1);
-        reporter.begin(&recording, &survey, &truth_m)?;
-        reporter.take_map(&survey, path, &map, &learned)?;
+        reporter.begin(&recording, &survey, &truth_m);
+        reporter.take_map(&survey, path, &map, &learned);
     }
 
     let mut rows = BaselineRows::default();
@@ -72,7 +77,7 @@ pub fn on_map(
     });
     let section = Section { dataset: recording.name.clone(), split: None, noisy: false, fixed: false };
     let shifts = PositionShift::of_map(&section, &map.info, &map.positions_m, &known.collect::<Vec<_>>());
-    Ok(Evaluation { entries, statistics, assignments: rows.assignments, shifts })
+    Ok(Evaluation { entries, statistics, assignments: rows.assignments, shifts, warnings, inputs: Vec::new() })
 }
 
 /// `recording` with its positions counted from the map's origin.
@@ -91,26 +96,31 @@ fn moved_to(map: &FeatureMap, path: &Path, mut recording: Recording) -> anyhow::
 }
 
 /// The recordings that a map was made of.
-fn open_surveys(args: &Args, path: &Path, map: &FeatureMap) -> anyhow::Result<Vec<Recording>> {
+fn open_surveys(
+    args: &Args,
+    path: &Path,
+    map: &FeatureMap,
+    warnings: &mut Vec<String>,
+) -> anyhow::Result<Vec<Recording>> {
     let recordings = open_recordings(&args.survey, None)?;
     for recording in &recordings {
         if !map.info.recordings.iter().any(|learned| learned.name == recording.name) {
             let of: Vec<&str> = map.info.recordings.iter().map(|learned| learned.name.as_str()).collect();
-            eprintln!(
-                "warning: {} was learned from {}, not from --survey {}: the baselines learn from another drive",
+            warnings.push(format!(
+                "{} was learned from {}, not from --survey {}: the baselines learn from another drive",
                 path.display(),
                 of.join(", "),
                 recording.name
-            );
+            ));
         }
     }
     let frames: usize = recordings.iter().map(|recording| recording.survey.len()).sum();
     if frames != map.positions_m.len() {
-        eprintln!(
-            "warning: {} was learned from {} frames, --survey has {frames}: the baselines do not learn from the same",
+        warnings.push(format!(
+            "{} was learned from {}, --survey has {frames}: the baselines do not learn from the same",
             path.display(),
-            map.positions_m.len()
-        );
+            counted(map.positions_m.len(), "frame")
+        ));
     }
     let moved = recordings.into_iter().map(|recording| {
         map.info

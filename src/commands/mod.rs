@@ -12,6 +12,7 @@ pub mod file_kind;
 pub mod frame_source;
 pub mod import;
 pub mod info;
+mod inputs;
 pub mod journal;
 pub mod localize;
 pub mod man;

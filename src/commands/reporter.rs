@@ -1,16 +1,14 @@
 //! `evaluate --report`: collects what the report shows while recordings are evaluated, and writes it.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::Context;
-use sha2::{Digest, Sha256};
 
 use super::options::command_line;
 use super::progress::Progress;
 use super::report_folder::ReportFolder;
-use crate::evaluate::{Case, Evaluation};
+use crate::evaluate::{Case, Evaluation, InputFile};
 use crate::map::FeatureMap;
 use crate::recording::Recording;
 use crate::report::{Dataset, MapFacts, Report, ReportStep, utc_text};
@@ -21,26 +19,31 @@ use crate::types::PositionM;
 pub struct Reporter {
     folder: ReportFolder,
     settings: Vec<(String, String)>,
+    inputs: Vec<InputFile>,
     datasets: Vec<Dataset>,
     /// What the map was learned from.
     learned: Vec<Recording>,
 }
 
 impl Reporter {
-    /// A report that goes to `folder`, which is made, and written to, now.
+    /// A report on `inputs` that goes to `folder`, which is made, and written to, now.
     ///
     /// # Errors
     /// There is something that must not be replaced, or a report, and `force` is not given; or it cannot be written to.
     pub fn new(folder: &Path, force: bool, settings: Vec<(String, String)>) -> anyhow::Result<Self> {
         let folder = ReportFolder::open(folder, force)?;
-        Ok(Self { folder, settings, datasets: Vec::new(), learned: Vec::new() })
+        Ok(Self { folder, settings, inputs: Vec::new(), datasets: Vec::new(), learned: Vec::new() })
+    }
+
+    /// The files that are read.
+    pub fn take_inputs(&mut self, inputs: &[InputFile]) {
+        self.inputs = inputs.to_vec();
     }
 
     /// What follows is of this recording.
-    pub fn begin(&mut self, recording: &Recording, survey: &Survey, truth_m: &[PositionM]) -> anyhow::Result<()> {
-        let sha256 = sha256_of(&recording.path)?;
+    pub fn begin(&mut self, recording: &Recording, survey: &Survey, truth_m: &[PositionM]) {
+        let sha256 = self.sha256_of(&recording.path);
         self.datasets.push(Dataset::new(recording, sha256, survey, truth_m));
-        Ok(())
     }
 
     /// What a recipe brought in the plain variant of a split.
@@ -61,12 +64,17 @@ impl Reporter {
         path: &Path,
         map: &FeatureMap,
         learned: &[Recording],
-    ) -> anyhow::Result<()> {
-        let (path, sha256) = (path.display().to_string(), sha256_of(path)?);
+    ) {
+        let (path, sha256) = (path.display().to_string(), self.sha256_of(path));
         let facts = MapFacts { path, sha256, info: map.info.clone(), cells: map.cells.len() };
         self.current().take_map(survey, map, facts);
         self.learned = learned.to_vec();
-        Ok(())
+    }
+
+    fn sha256_of(&self, path: &Path) -> String {
+        let file = path.display().to_string();
+        let input = self.inputs.iter().find(|input| input.file == file);
+        input.expect("every recording and map is an input").sha256.clone()
     }
 
     /// The results of the recording that was begun last.
@@ -86,6 +94,7 @@ impl Reporter {
             made: utc_text(now_s),
             command: command_line(),
             settings: self.settings,
+            inputs: self.inputs,
             datasets: self.datasets,
         };
         let on_step = |step| match step {
@@ -98,19 +107,4 @@ impl Reporter {
         report.write(self.folder.drawing(), recordings, &self.learned, on_step).with_context(context)?;
         self.folder.show().with_context(context)
     }
-}
-
-fn sha256_of(path: &Path) -> anyhow::Result<String> {
-    let context = || format!("reading {}", path.display());
-    let mut file = fs::File::open(path).with_context(context)?;
-    let mut hash = Sha256::new();
-    let mut buffer = vec![0; 1 << 16];
-    loop {
-        let read = std::io::Read::read(&mut file, &mut buffer).with_context(context)?;
-        if read == 0 {
-            break;
-        }
-        hash.update(&buffer[..read]);
-    }
-    Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }

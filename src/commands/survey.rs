@@ -211,6 +211,25 @@ pub fn read_truth(path: &std::path::Path, survey: &Survey) -> anyhow::Result<Vec
     Ok(positions_m)
 }
 
+/// A truth that lies further from the recorded positions than any receiver errs is of another drive, or counted from another
+/// origin \[m\].
+const ELSEWHERE_M: f64 = 10.0;
+
+/// Why `truth_m`, read from `path`, is hardly that of `survey`.
+pub fn elsewhere(path: &std::path::Path, truth_m: &[PositionM], survey: &Survey) -> Option<String> {
+    let apart = truth_m.iter().zip(&survey.frames);
+    let mut apart_m: Vec<f64> = apart.map(|(&truth_m, frame)| distance_m(truth_m, frame.position_m)).collect();
+    apart_m.sort_unstable_by(f64::total_cmp);
+    let median_m = *apart_m.get(apart_m.len() / 2)?;
+    (median_m > ELSEWHERE_M).then(|| {
+        format!(
+            "--truth {}: half of its positions are more than {median_m:.1} m from the recorded ones: is it the truth of this \
+             recording, from the same origin?",
+            path.display()
+        )
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -4,6 +4,7 @@
 mod against_map;
 pub mod baselines;
 mod entry;
+mod input;
 mod map_baselines;
 mod protocol;
 mod sequence;
@@ -13,6 +14,7 @@ pub mod statistics;
 pub use against_map::{AgainstMap, MapOutcome, against_map, map_entries};
 pub use baselines::WordAssignment;
 pub use entry::{Entry, FrameEntry, LEGEND, emax_m, table};
+pub use input::InputFile;
 pub use map_baselines::MapComparison;
 pub use protocol::{Case, CaseResults, Protocol, Variant};
 pub use sequence::{Sequence, SequenceFigures, SequencePose};
@@ -30,4 +32,8 @@ pub struct Evaluation {
     pub assignments: Vec<WordAssignment>,
     /// One a trial, or recording of a map, whose positions were smoothed.
     pub shifts: Vec<PositionShift>,
+    /// Of all recordings together.
+    pub inputs: Vec<InputFile>,
+    /// What makes the results doubtful.
+    pub warnings: Vec<String>,
 }

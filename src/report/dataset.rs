@@ -30,6 +30,8 @@ pub struct Dataset {
     pub statistics: Statistics,
     pub assignments: Vec<WordAssignment>,
     pub shifts: Vec<PositionShift>,
+    /// What makes the results doubtful.
+    pub warnings: Vec<String>,
     /// The map that was measured against.
     pub map: Option<MapFacts>,
     /// By row.
@@ -170,6 +172,7 @@ impl Dataset {
             statistics: Statistics::default(),
             assignments: Vec::new(),
             shifts: Vec::new(),
+            warnings: Vec::new(),
             map: None,
             photographs: BTreeMap::new(),
         }
@@ -218,6 +221,7 @@ impl Dataset {
         self.statistics = evaluation.statistics.clone();
         self.assignments = evaluation.assignments.clone();
         self.shifts = evaluation.shifts.clone();
+        self.warnings = evaluation.warnings.clone();
         let row_of = |index: usize| self.frames.iter().position(|frame| frame.index == index);
         let of_drive = |entry: &&Entry| entry.estimator != "single";
         self.sequences = self.entries.iter().filter(of_drive).map(|entry| ShownSequence::of(entry, row_of)).collect();

@@ -34,6 +34,7 @@ use figure::{Drawn, Figure};
 use gallery::Gallery;
 use tables::Table;
 
+use crate::evaluate::InputFile;
 use crate::gnss::date_of_day;
 use crate::recording::{Recording, RecordingError, write_bytes_atomically};
 
@@ -50,6 +51,8 @@ pub struct Report {
     pub command: Vec<String>,
     /// Options and what they were.
     pub settings: Vec<(String, String)>,
+    /// The files that were read.
+    pub inputs: Vec<InputFile>,
     pub datasets: Vec<Dataset>,
 }
 
@@ -179,6 +182,7 @@ impl Report {
                 "results": dataset.entries,
                 "statistics": dataset.statistics,
                 "position_shifts": dataset.shifts,
+                "warnings": dataset.warnings,
             })
         });
         json!({
@@ -186,6 +190,7 @@ impl Report {
             "made": self.made,
             "command": self.command,
             "settings": self.settings.iter().cloned().collect::<std::collections::BTreeMap<_, _>>(),
+            "inputs": self.inputs,
             "datasets": datasets.collect::<Vec<_>>(),
             "tables": tables,
             "figures": figures,
@@ -218,6 +223,7 @@ mod tests {
             made: String::new(),
             command: command.iter().map(|argument| (*argument).to_owned()).collect(),
             settings: Vec::new(),
+            inputs: Vec::new(),
             datasets: Vec::new(),
         }
     }

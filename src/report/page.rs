@@ -64,6 +64,9 @@ const FIRST: usize = 4;
 
 fn put_dataset(page: &mut String, dataset: &Dataset, part: &Part) {
     let _ = write!(page, "<section id=\"{}\"><h2>{}</h2>", dataset.id, escaped(&dataset.name));
+    for warning in &dataset.warnings {
+        let _ = write!(page, "<p class=\"warning\"><b>Doubtful:</b> {}</p>", escaped(warning));
+    }
     put_glance(page, dataset);
     for drawn in &part.drawn[..part.drawn.len().min(FIRST)] {
         put_drawn(page, drawn);
@@ -249,9 +252,20 @@ fn put_provenance(page: &mut String, report: &Report) {
             *page += "</details>";
         }
     }
+    put_inputs(page, report);
     *page += "<h3>Settings</h3>";
     put_facts(page, &report.settings.iter().map(|(key, value)| (key.as_str(), value.clone())).collect::<Vec<_>>());
     let _ = write!(page, "<h4>To repeat it</h4><pre>{}</pre></section>", escaped(&report.command_line()));
+}
+
+fn put_inputs(page: &mut String, report: &Report) {
+    *page += "<h3>Files that were read</h3><div class=\"scroll\" tabindex=\"0\"><table class=\"inputs\"><thead><tr><th></th><th>file\
+              </th><th>SHA-256</th></tr></thead><tbody>";
+    for input in &report.inputs {
+        let (file, sha256) = (escaped(&input.file), escaped(&input.sha256));
+        let _ = write!(page, "<tr><th>{}</th><td>{file}</td><td><code>{sha256}</code></td></tr>", input.role);
+    }
+    *page += "</tbody></table></div>";
 }
 
 /// How far positions were moved before anything was learned at them.

@@ -3,8 +3,8 @@
     look_at_page.py CHROMIUM PAGE.html WIDTH[,WIDTH...] [--screenshots FOLDER]
 
 One JSON object a width on stdout: console errors, requests beyond the page itself, pictures that do not load, elements
-that stick out of the page, tables that scroll without a sign of it, links that lead nowhere, and the smallest letters. Only Python's own library: the
-browser is steered through --remote-debugging-pipe, whose messages end with a zero byte.
+that stick out of the page, tables that scroll without a sign of it, links that lead nowhere, and the smallest letters.
+Only Python's own library: the browser is steered through --remote-debugging-pipe, whose messages end with a zero byte.
 """
 
 import base64
