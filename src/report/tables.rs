@@ -8,7 +8,7 @@ use super::dataset::Dataset;
 use super::figures::{RECALL_AT_M, cases, recall_at};
 use super::methods::{Kind, Method, feature_name, methods};
 use crate::evaluate::{Entry, emax_m};
-use crate::evaluate::statistics::Estimate;
+use crate::evaluate::statistics::{Estimate, p_text};
 
 #[derive(Debug, Clone)]
 pub struct Table {
@@ -377,7 +377,7 @@ fn intervals(dataset: &Dataset) -> Table {
             let difference = comparison.map(|comparison| three(&comparison.mean_difference_m));
             cells.extend((0..3).map(|i| Cell::meters(difference.map(|values| values[i]))));
             cells.push(Cell::percent(comparison.map(|comparison| comparison.closer_share.value)));
-            cells.push(Cell::decimals(comparison.map(|comparison| comparison.p_holm), 4));
+            cells.push(Cell::of(comparison.map(|comparison| comparison.p_holm), p_text));
             rows.push(Row {
                 label: method.label.clone(),
                 begins_group: group.take(),

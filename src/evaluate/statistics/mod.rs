@@ -207,6 +207,11 @@ impl Method {
     }
 }
 
+/// A `p` with three decimals; smaller ones only as such.
+pub fn p_text(p: f64) -> String {
+    if p < 0.001 { "< 0.001".into() } else { format!("{p:.3}") }
+}
+
 impl Estimate {
     /// `value` with the interval of what the draws brought.
     fn of(value: f64, mut drawn: Vec<f64>) -> Self {
@@ -283,6 +288,12 @@ mod tests {
             Entry { recipe, features: features.into(), split: Some("random".into()), ..entry(seed, &errors_m) }
         };
         (0..seeds).map(of_seed).collect()
+    }
+
+    #[test]
+    fn no_p_is_written_as_zero() {
+        let found = [1.0, 0.049_6, 0.001, 0.000_99, 1e-4].map(p_text);
+        assert_eq!(found, ["1.000", "0.050", "0.001", "< 0.001", "< 0.001"]);
     }
 
     #[test]

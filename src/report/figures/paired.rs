@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use super::errors::cases;
-use crate::evaluate::statistics::Comparison;
+use crate::evaluate::statistics::{Comparison, p_text};
 use crate::report::chart::color::{INK, MUTED};
 use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, NOTE, Panel, Plot, Spec};
 use crate::report::chart::scale::{Scale, meters, number};
@@ -98,10 +98,8 @@ fn panel(title: &str, all: &[Compared], width_px: f64) -> Panel {
         let left = plot.area_at[0] + 2.0;
         plot.label([left, middle], &fitted(&one.label, NOTE.size_px, false, width_px - 150.0), NOTE);
         let sign = if estimate.value > 0.0 { "+" } else { "" };
-        let p = match one.comparison.p_holm {
-            p if p < 0.001 => "p < 0.001".to_owned(),
-            p => format!("p = {}", number(p, 3)),
-        };
+        let p = p_text(one.comparison.p_holm);
+        let p = if p.starts_with('<') { format!("p {p}") } else { format!("p = {p}") };
         let right = plot.area_at[0] + plot.area_size[0];
         let text = format!("{sign}{} m, {p}", meters(estimate.value));
         plot.label([right, middle], &text, LABEL.anchored(Anchor::End));
