@@ -211,6 +211,19 @@ fn what_is_drawn_is_what_the_results_say() {
     assert_eq!(dataset["map"]["info"]["recordings"][0]["frames"], 120);
 }
 
+/// Whether the stated uncertainty keeps its promise is said in words, by the numbers that are drawn.
+#[test]
+fn the_page_says_whether_coverage_is_as_stated() {
+    let (page, json) = (page(&map_report()), json(&map_report()));
+    let series = json["figures"]["corridor-7-day-2-reliability"]["data"].as_array().expect("a list");
+    assert!(series.len() >= 2, "{series:?}");
+    for one in series {
+        let [estimates, verdict] = ["estimates", "verdict"].map(|key| one[key].as_str().expect("a text"));
+        assert!(["over-confident", "too cautious", "as stated"].contains(&verdict), "{verdict}");
+        assert!(page.contains(&format!("({estimates}: {verdict})")), "{estimates} {verdict}");
+    }
+}
+
 /// Every file that was read is named with its checksum: recording, map, and what the map was learned from.
 #[test]
 fn the_files_that_were_read_are_on_the_page_with_their_checksums() {

@@ -21,8 +21,10 @@ use crate::evaluate::{
 };
 use crate::features::Descriptor;
 use crate::map::{Recipe, RecipeName, Selection, Smoothing, SplitKind};
+use crate::metrics::coverage_verdict;
 use crate::recording::{Recording, write_bytes_atomically};
 use crate::train::{Outcomes, Similarity, Split, Survey, TrackSmoother, Trial};
+use crate::types::counted;
 
 /// Measure how well the method localizes on recordings
 ///
@@ -243,13 +245,16 @@ fn in_words(entries: &[Entry]) -> String {
             text += "filtered: not sure of the position in any frame, so there are no errors to speak of\n";
         }
         let Some(covered) = entry.coverage_95 else { continue };
+        let frames = entry.frames.iter().flatten().filter(|frame| frame.est_e_m.is_some()).count();
         text += &format!(
-            "{}: the region of 95 % holds the true position in {:.1} % of the frames",
+            "{}: the region of 95 % holds the true position in {:.1} % of {}: {}",
             entry.estimator,
-            100.0 * covered
+            100.0 * covered,
+            counted(frames, "frame"),
+            coverage_verdict(covered, frames)
         );
         if let Some(nees) = entry.nees_mean {
-            text += &format!(", mean NEES {nees:.2} (2 is exact)");
+            text += &format!("; mean NEES {nees:.2} (2 is exact)");
         }
         if let Some(heading_deg) = entry.heading_median_deg {
             text += &format!("; heading off by {heading_deg:.1} deg (median)");

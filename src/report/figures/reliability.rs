@@ -2,6 +2,7 @@
 
 use serde_json::json;
 
+use crate::metrics::coverage_verdict;
 use crate::report::chart::color::{FAINT, INK};
 use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, NOTE, Panel, Plot, Spec};
 use crate::report::chart::scale::{Scale, number};
@@ -45,13 +46,18 @@ pub fn reliability(dataset: &Dataset) -> Drawn {
             "coverage_50": coverage(&levels, 0.5),
             "coverage_90": coverage(&levels, 0.9),
             "coverage_95": coverage(&levels, 0.95),
+            "verdict": coverage_verdict(coverage(&levels, 0.95), levels.len()),
         })
     });
     let data: Vec<_> = data.collect();
-    let caption = "Left: a curve on the dashed line keeps its promise; below it the regions are too small (over-confident), \
-                   above it too large. Right: the normalised error squared should follow χ² with two degrees of freedom, \
-                   of median 1.4 and mean 2; a curve further right is over-confident, further left too cautious. Gray: \
-                   where 95 % of such curves lie by chance.";
+    let verdicts: Vec<String> = series.iter().map(verdict).collect();
+    let caption = format!(
+        "Regions that should hold the truth in 95 % of the frames hold it in {}. Left: a curve on the dashed line keeps its promise; below it the regions \
+         are too small (over-confident), above it too large. Right: the normalised error squared should follow χ² with two \
+         degrees of freedom, of median 1.4 and mean 2; a curve further right is over-confident, further left too cautious. \
+         Gray: where 95 % of such curves lie by chance.",
+        verdicts.join(", ")
+    );
     let figure = Figure::new(format!("{}-reliability", dataset.id), TITLE, caption, json!(data));
     figure.with_panels(vec![coverage_panel(&series), nees_panel(&series), table_panel(&series)]).into()
 }
@@ -78,8 +84,21 @@ fn series(dataset: &Dataset) -> Vec<Series<'_>> {
     of_insights.chain(of_sequences).filter(|series| series.answers.len() >= MIN_FRAMES).collect()
 }
 
-fn coverage(sorted_levels: &[f64], nominal: f64) -> f64 {
-    sorted_levels.iter().filter(|&&level| level < nominal).count() as f64 / sorted_levels.len() as f64
+/// As in `93 % of 378 (filtered: as stated)`.
+fn verdict(series: &Series) -> String {
+    let levels: Vec<f64> = series.answers.iter().map(|a| a.credible_level).collect();
+    let covered = coverage(&levels, 0.95);
+    format!(
+        "{} % of {} ({}: {})",
+        number(100.0 * covered, 0),
+        levels.len(),
+        series.label,
+        coverage_verdict(covered, levels.len())
+    )
+}
+
+fn coverage(levels: &[f64], nominal: f64) -> f64 {
+    levels.iter().filter(|&&level| level < nominal).count() as f64 / levels.len() as f64
 }
 
 /// Between these lies the mean NEES of n independent frames with a probability of 95 %: χ² with 2n degrees of freedom over
