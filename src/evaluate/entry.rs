@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::sequence::{Sequence, SequenceFigures};
 use crate::metrics::ErrorFigures;
-use crate::types::{LocalizationState, PositionM};
+use crate::types::{LocalizationState, PositionM, counted};
 
 /// One row of the evaluation. The names are a contract with scripts: keys are added, never renamed; `null` where a
 /// figure has no meaning.
@@ -183,12 +183,12 @@ pub fn table(entries: &[Entry]) -> String {
 }
 
 fn heading(first: &Entry, seeds: usize) -> String {
-    let counts =
-        format!("{} learning, {} validation, {} test frames", first.n_learning, first.n_validation, first.n_test);
+    let n_test = counted(first.n_test, "test frame");
+    let counts = format!("{} learning, {} validation, {n_test}", first.n_learning, first.n_validation);
     let title = match (&first.split, seeds) {
         (Some(split), 1) => format!("{split} split: {counts}"),
         (Some(split), _) => format!("{split} split: {counts}, mean over {seeds} seeds"),
-        (None, _) => format!("against a map: {} frames", first.n_test),
+        (None, _) => format!("against a map: {}", counted(first.n_test, "frame")),
     };
     format!(
         "\n{title}\n{:8} {:26} {:>6} {:>5} {:>5} {:>12} {:>7} {:>7} {:>7} {:>7} | {:>7} {:>7} {:>7} {:>7} {:>6} {:>6} | {:>8} {:>8}\n",

@@ -15,6 +15,7 @@ use super::methods::{Kind, Method, headline, methods};
 use super::{Part, gallery};
 use crate::evaluate::PositionShift;
 use crate::map::Selection;
+use crate::types::counted;
 
 const STYLE: &str = include_str!("page.css");
 /// Nothing may be fetched, and nothing runs.
@@ -121,7 +122,7 @@ fn in_words(method: &Method, all: &[Method], case: &str) -> String {
     let seeds = method.entries.len();
     let n_test: usize = method.entries.iter().map(|entry| entry.n_test).sum();
     let mut text = match seeds {
-        1 => format!("{}, {n_test} frames: ", capitalized(case)),
+        1 => format!("{}, {}: ", capitalized(case), counted(n_test, "frame")),
         _ => format!("{}, {n_test} test frames over {seeds} seeds: ", capitalized(case)),
     };
     let rmse = |method: &Method| method.mean(|e| e.rmse_m).map(meters).unwrap_or_else(|| "–".into());
@@ -219,9 +220,9 @@ fn put_provenance(page: &mut String, report: &Report) {
         put_shifts(page, dataset);
         if let Some(map) = &dataset.map {
             let info = &map.info;
-            let recordings = info.recordings.iter().map(|r| format!("{} ({} frames)", r.name, r.frames));
+            let recordings = info.recordings.iter().map(|r| format!("{} ({})", r.name, counted(r.frames, "frame")));
             let groups =
-                info.groups.iter().map(|group| format!("{} ({} features)", group.recipe.descriptor, group.features));
+                info.groups.iter().map(|group| format!("{} ({})", group.recipe.descriptor, counted(group.features, "feature")));
             let selection = match info.selection {
                 Selection::None => "none",
                 Selection::Backward => "backward elimination",

@@ -8,6 +8,7 @@ use super::dataset::Dataset;
 use super::figures::{RECALL_AT_M, cases, recall_at};
 use super::methods::{Kind, Method, feature_name, methods};
 use crate::evaluate::{Entry, emax_m};
+use crate::types::counted;
 use crate::evaluate::statistics::{Estimate, p_text};
 
 #[derive(Debug, Clone)]
@@ -173,8 +174,10 @@ fn paper_shape(dataset: &Dataset) -> Table {
         let begins = (before.as_ref() != Some(&key)).then(|| {
             let split = first.split.clone().unwrap_or_default();
             format!(
-                "{recipe} recipe, {split} split: {} learning, {} validation, {} test images",
-                first.n_learning, first.n_validation, first.n_test
+                "{recipe} recipe, {split} split: {} learning, {} validation, {}",
+                first.n_learning,
+                first.n_validation,
+                counted(first.n_test, "test image")
             )
         });
         before = Some(key);
