@@ -14,8 +14,8 @@ use serde_json::Value;
 use sha2::{Digest, Sha256};
 use tempfile::TempDir;
 
-/// A name that wants to be more than text.
-const HOSTILE: &str = "yard <script>alert(1)</script> & \"quotes\"";
+/// A name that wants to be more than text, in a page and on a terminal.
+const HOSTILE: &str = "yard <script>alert(1)</script> & \"quotes\" \u{1b}[31m\u{7}\u{9b}2J";
 
 /// A report of the protocol, on the sample's first photographs under a hostile name, and the folder it lies in.
 fn protocol_report() -> PathBuf {
@@ -30,6 +30,9 @@ fn protocol_report() -> PathBuf {
             .args(["--features", "sp", "--seeds", "2", "--variants", "plain", "--grid-step-m", "1", "--report"])
             .arg(&report));
         assert_eq!(code, 0, "{stderr}");
+        let is_harmless = |text: &str| text.chars().all(|character| character == '\n' || !character.is_control());
+        assert!(is_harmless(&stdout) && is_harmless(&stderr), "{stdout:?}{stderr:?}");
+        assert!(stdout.contains("yard <script>") && stdout.contains("\u{fffd}[31m"), "{stdout}");
         assert!(stdout.contains("report/index.html") && stderr.contains("report: drawing"), "{stdout}{stderr}");
         folder
     });
@@ -305,7 +308,9 @@ fn the_page_fetches_nothing_and_believes_no_name() {
         assert!(page.contains("default-src 'none'"));
     }
     let hostile = page(&protocol_report());
-    assert!(hostile.contains("yard &lt;script&gt;alert(1)&lt;\u{2215}script&gt; &amp; &quot;quotes&quot;"));
+    assert!(hostile.contains("yard &lt;script&gt;alert(1)&lt;\u{2215}script&gt; &amp; &quot;quotes&quot; \u{fffd}[31m\u{fffd}\u{fffd}2J"));
+    let is_text = |character: char| matches!(character, '\n' | '\t') || !character.is_control();
+    assert!(hostile.chars().all(is_text), "control characters on the page");
 }
 
 #[test]

@@ -180,7 +180,7 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         }
         let Evaluation { entries, statistics, assignments, shifts, warnings, .. } = evaluation;
         progress.finish();
-        print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
+        print(&format!("\nTable {}: {}\n{}", number + 1, printable(&recording.name), table(&entries)))?;
         print(&in_words(&entries))?;
         PositionShift::lines(&shifts).iter().try_for_each(|line| print(&format!("{}\n", printable(line))))?;
         print(&statistics::text(&statistics))?;
@@ -301,7 +301,8 @@ fn protocol(
     let has_yaws = plain.frames.iter().all(|frame| frame.yaw_rad.is_some());
     let fixed = if wants_fixed && has_yaws { Some(read_all(true)?) } else { None };
     if wants_fixed && fixed.is_none() {
-        eprintln!("note: {}: not every frame has a yaw; there are no (fixed) rows", recording.name);
+        let name = printable(&recording.name);
+        eprintln!("note: {name}: not every frame has a yaw; there are no (fixed) rows");
     }
     let exact_m = args.truth.as_ref().map(|path| read_truth(path, &plain)).transpose()?;
     let smooths = |recipe: &Recipe| args.smooth.unwrap_or(Smoothing::usual(recipe.name)) == Smoothing::Track;
