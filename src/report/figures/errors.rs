@@ -96,7 +96,7 @@ fn comparison_panel(dataset: &Dataset, title: &str, methods: &[&Method], width_p
     let high = all.iter().copied().fold(0.0, f64::max) * 1.6;
     let x = Axis::new("error [m], logarithmic", Scale::log(low, high));
     let y = Axis::new("", Scale::linear(0.0, methods.len() as f64)).with_ticks([]);
-    let mut spec = Spec::new(title, x, y);
+    let mut spec = Spec::new(format!("{title}: RMSE (median)"), x, y);
     spec.width_px = width_px;
     spec.area_height_px = ROW_PX * methods.len() as f64 + 6.0;
     spec.legend = vec![

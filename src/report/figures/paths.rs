@@ -8,7 +8,7 @@ use crate::report::chart::color::{BLUE, ERROR_CLASSES, FAINT, INK, VERMILION};
 use crate::report::chart::map_plot::{Extent, ellipse_m, map_plot};
 use crate::report::chart::plot::{Key, LABEL, LegendItem, Panel, Plot};
 use crate::report::chart::scale::{meters, number};
-use crate::report::chart::svg::Paint;
+use crate::report::chart::svg::{Anchor, Paint};
 use crate::report::dataset::Dataset;
 use crate::report::figure::{Drawn, Figure};
 use crate::report::insight::{FrameAnswer, Insight};
@@ -140,10 +140,10 @@ fn estimates_panel(dataset: &Dataset, extent: Extent, layer: &Layer, width_px: f
     plot.finish()
 }
 
-/// A note in the upper left corner of a map.
+/// A note above the right end of a map, where nothing lies below it.
 fn put_note(plot: &mut Plot, text: &str) {
-    let at = [plot.area_at[0] + 6.0, plot.area_at[1] + 14.0];
-    plot.above.haloed_text(at, text, LABEL);
+    let at = [plot.area_at[0] + plot.area_size[0], plot.area_at[1] - 9.0];
+    plot.above.text(at, text, LABEL.anchored(Anchor::End));
 }
 
 /// Where on the map the errors are.
