@@ -208,7 +208,7 @@ pub fn photographs(recording: &Recording, rows: &BTreeSet<usize>) -> Result<BTre
 /// A split's worst frames as HTML.
 pub fn html(dataset: &Dataset, Gallery { chosen, worst }: &Gallery) -> String {
     let mut html = format!(
-        "<h4>{}</h4><p>The largest errors of the <b>{}</b>, each frame once. Panoramas begin to the east where the yaw is \
+        "<h4>{}</h4><p class=\"before-gallery\">The largest errors of the <b>{}</b>, each frame once. Panoramas begin to the east where the yaw is \
          known, so that those of one place look alike.</p><div class=\"gallery\">",
         escaped(&capitalized(&chosen.case)),
         escaped(&chosen.method),

@@ -64,7 +64,7 @@ pub fn html(report: &Report, parts: &[Part]) -> String {
 const FIRST: usize = 4;
 
 fn put_dataset(page: &mut String, dataset: &Dataset, part: &Part) {
-    let _ = write!(page, "<section id=\"{}\"><h2>{}</h2>", dataset.id, escaped(&dataset.name));
+    let _ = write!(page, "<section id=\"{}\" class=\"dataset\"><h2>{}</h2>", dataset.id, escaped(&dataset.name));
     for warning in &dataset.warnings {
         let _ = write!(page, "<p class=\"warning\"><b>Doubtful:</b> {}</p>", escaped(warning));
     }
@@ -163,6 +163,8 @@ fn put_figure(page: &mut String, figure: &Figure) {
             " full"
         } else if width > 400.0 {
             " halves"
+        } else if panels.len() == 4 && width < 300.0 {
+            " quarters"
         } else {
             ""
         };
