@@ -308,7 +308,9 @@ fn the_page_fetches_nothing_and_believes_no_name() {
         assert!(page.contains("default-src 'none'"));
     }
     let hostile = page(&protocol_report());
-    assert!(hostile.contains("yard &lt;script&gt;alert(1)&lt;\u{2215}script&gt; &amp; &quot;quotes&quot; \u{fffd}[31m\u{fffd}\u{fffd}2J"));
+    assert!(hostile.contains(
+        "yard &lt;script&gt;alert(1)&lt;\u{2215}script&gt; &amp; &quot;quotes&quot; \u{fffd}[31m\u{fffd}\u{fffd}2J"
+    ));
     let is_text = |character: char| matches!(character, '\n' | '\t') || !character.is_control();
     assert!(hostile.chars().all(is_text), "control characters on the page");
 }

@@ -154,13 +154,28 @@ fn the_protocol_runs_with_both_recipes_and_a_split_from_a_file() {
 fn it_is_said_how_far_smoothing_moved_the_positions() {
     let folder = folder();
     let (dataset, recording) = (folder.path().join("town"), folder.path().join("town.mcap"));
-    omniloc().args(["simulate", "--world", "town", "--frames", "60", "--size", "320x180", "--out"]).arg(&dataset).assert().success();
+    omniloc()
+        .args(["simulate", "--world", "town", "--frames", "60", "--size", "320x180", "--out"])
+        .arg(&dataset)
+        .assert()
+        .success();
     omniloc().arg("import").arg(&dataset).arg("--out").arg(&recording).assert().success();
     let results = folder.path().join("results.json");
     let (code, stdout, stderr) = run(omniloc()
         .arg("evaluate")
         .arg(&recording)
-        .args(["--features", "gradient", "--recipe", "default", "--seeds", "2", "--split", "random", "--grid-step-m", "5"])
+        .args([
+            "--features",
+            "gradient",
+            "--recipe",
+            "default",
+            "--seeds",
+            "2",
+            "--split",
+            "random",
+            "--grid-step-m",
+            "5",
+        ])
         .args(["--variants", "plain", "--baselines", "none", "--json"])
         .arg(&results));
     assert_eq!(code, 0, "{stderr}");
@@ -314,6 +329,11 @@ fn no_output_may_be_an_input_and_arguments_that_contradict_are_refused() {
         vec!["evaluate", path, "--json", "/dev/null"],
         vec!["evaluate", path, "--map", "x.map", "--seeds", "2"],
         vec!["evaluate", path, "--split", "random,random"],
+        vec!["evaluate", path, "--split", "nowhere.csv"],
+        vec!["evaluate", path, "--split", "."],
+        vec!["evaluate", path, "--truth", "nowhere.csv"],
+        vec!["evaluate", path, "--truth", "."],
+        vec!["evaluate", path, "--map", "."],
         vec!["evaluate", path, "--seed", "18446744073709551615", "--seeds", "2"],
     ] {
         let (code, _, stderr) = run(omniloc().args(&arguments).current_dir(folder.path()));
@@ -349,6 +369,9 @@ fn a_bad_split_or_truth_names_its_line() {
     fs::write(&truth, "index,x_m,y_m\n0,1,2\n1,NaN,3\n").expect("writes");
     let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--truth").arg(&truth));
     assert!(code == 1 && stderr.contains("truth.csv: line 3: x_m is `NaN`"), "{stderr}");
+    // As of any other file that holds something else.
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&split));
+    assert!(code == 1 && stderr.contains("not an MCAP recording"), "{stderr}");
 }
 
 #[test]
@@ -367,7 +390,18 @@ fn a_truth_of_another_place_is_warned_about() {
         let (code, _, stderr) = run(omniloc()
             .arg("evaluate")
             .arg(&recording)
-            .args(["--features", "gradient", "--recipe", "default", "--seeds", "1", "--split", "random", "--grid-step-m", "10"])
+            .args([
+                "--features",
+                "gradient",
+                "--recipe",
+                "default",
+                "--seeds",
+                "1",
+                "--split",
+                "random",
+                "--grid-step-m",
+                "10",
+            ])
             .args(["--variants", "plain", "--baselines", "none", "--force", "--truth"])
             .arg(&truth)
             .arg("--json")

@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::evaluate_map::on_map;
 use super::inputs::inputs;
-use super::options::{OutputKind, check_input, check_not_input, check_output, command_line, resolved};
+use super::options::{OutputKind, check_input, check_no_folder, check_not_input, check_output, command_line, resolved};
 use super::progress::Progress;
 use super::reporter::Reporter;
 use super::survey::{
@@ -134,6 +134,14 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         if *baseline == Baseline::None && args.baselines.len() > 1 {
             return Err(refused("goes with no other").into());
         }
+    }
+    for file in args.map.iter().chain(&args.truth) {
+        check_input(file)?;
+        check_no_folder(file)?;
+    }
+    for split in args.split.iter().filter(|split| !matches!(split.as_str(), "random" | "blocked")) {
+        let is_file = check_input(Path::new(split)).and_then(|()| check_no_folder(Path::new(split)));
+        is_file.with_context(|| format!("--split {split}: neither random nor blocked nor a file"))?;
     }
     if args.truth.is_some() && args.recordings.len() > 1 {
         return Err(BadArgument("--truth goes with one recording".into()).into());
@@ -322,7 +330,8 @@ fn protocol(
         reporter.begin(recording, &plain, exact_m.as_ref().unwrap_or(&plain.positions_m()));
     }
     let doubtful = args.truth.as_ref().zip(exact_m.as_ref());
-    let warnings: Vec<String> = doubtful.and_then(|(path, truth_m)| elsewhere(path, truth_m, &plain)).into_iter().collect();
+    let warnings: Vec<String> =
+        doubtful.and_then(|(path, truth_m)| elsewhere(path, truth_m, &plain)).into_iter().collect();
     warnings.iter().for_each(|warning| eprintln!("warning: {}", printable(warning)));
     let mut all = Evaluation { warnings, ..Evaluation::default() };
     for case in cases(args, &plain)? {
@@ -376,8 +385,6 @@ fn cases(args: &Args, survey: &Survey) -> anyhow::Result<Vec<Case>> {
             "random" => SplitKind::Random,
             "blocked" => SplitKind::Blocked,
             path => {
-                check_input(Path::new(path))
-                    .with_context(|| format!("--split {path}: neither random nor blocked nor a file"))?;
                 let indices: Vec<usize> = survey.frames.iter().map(|frame| frame.index).collect();
                 let file = std::fs::File::open(path).with_context(|| format!("opening the split {path}"))?;
                 let split = Split::from_csv(file, &indices).with_context(|| format!("reading the split {path}"))?;

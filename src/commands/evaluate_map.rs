@@ -6,10 +6,10 @@ use anyhow::Context;
 
 use super::evaluate::{Args, read_views};
 use super::options::check_input;
+use super::printable;
 use super::progress::Progress;
 use super::reporter::Reporter;
 use super::survey::{elsewhere, open_recordings, read_to_match, read_truth};
-use super::printable;
 use crate::evaluate::baselines::{Baseline, BaselineRows};
 use crate::evaluate::statistics::Section;
 use crate::evaluate::{Evaluation, MapComparison, PositionShift, Statistics, map_entries};

@@ -13,8 +13,7 @@ use crate::evaluate::InputFile;
 /// Every file that `args` name; a folder stands for the recordings in it.
 pub fn inputs(args: &Args) -> anyhow::Result<Vec<InputFile>> {
     let of = |role: &'static str, paths: Vec<PathBuf>| paths.into_iter().map(move |path| (role, path));
-    // What is neither is refused where it is read, by its own words.
-    let is_file = |split: &&String| !matches!(split.as_str(), "random" | "blocked") && Path::new(split).is_file();
+    let is_file = |split: &&String| !matches!(split.as_str(), "random" | "blocked");
     let splits = args.split.iter().filter(is_file).map(PathBuf::from).collect();
     let files = of("recording", with_folders(&args.recordings)?)
         .chain(of("map", args.map.iter().cloned().collect()))

@@ -43,7 +43,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 /// Done.
 pub const DONE: u8 = 0;
-/// The command could not do its work.
+/// The command could not do its work: what a file holds, be it a recording, a map or a CSV, is part of that.
 pub const FAILED: u8 = 1;
 /// Bad arguments or a bad configuration file.
 pub const BAD_ARGUMENTS: u8 = 2;

@@ -58,13 +58,7 @@ impl Reporter {
     }
 
     /// The map that is measured against, and the recordings that it was learned from, as far as they are known.
-    pub fn take_map(
-        &mut self,
-        survey: &Survey,
-        path: &Path,
-        map: &FeatureMap,
-        learned: &[Recording],
-    ) {
+    pub fn take_map(&mut self, survey: &Survey, path: &Path, map: &FeatureMap, learned: &[Recording]) {
         let (path, sha256) = (path.display().to_string(), self.sha256_of(path));
         let facts = MapFacts { path, sha256, info: map.info.clone(), cells: map.cells.len() };
         self.current().take_map(survey, map, facts);

@@ -172,8 +172,10 @@ mod tests {
         // (0.25 + 0 + 0.25 + 1) / 4
         assert_eq!(
             PositionShift::lines(&shifts),
-            ["positions of yard that the default recipe learned from: moved by smoothing, by 0.61 m (root mean square, over \
-              2 trials), frame 12 furthest, by 1.00 m"]
+            [
+                "positions of yard that the default recipe learned from: moved by smoothing, by 0.61 m (root mean square, over \
+              2 trials), frame 12 furthest, by 1.00 m"
+            ]
         );
         assert_eq!(of(0, &[]), None);
     }
@@ -182,14 +184,8 @@ mod tests {
     fn positions_that_were_left_alone_say_why() {
         let alone = TrackReport::LeftAlone(NotATrack::NoYaw);
         let positions = [[0.0, 0.0]; 2];
-        let shift = PositionShift::of_trial(
-            (section(), None),
-            "default",
-            &[0, 1],
-            [&positions, &positions],
-            &[0, 1],
-            alone,
-        );
+        let shift =
+            PositionShift::of_trial((section(), None), "default", &[0, 1], [&positions, &positions], &[0, 1], alone);
         let lines = PositionShift::lines(&shift.into_iter().collect::<Vec<_>>());
         assert!(lines[0].ends_with("as recorded: not every frame has a yaw"), "{lines:?}");
     }

@@ -249,7 +249,10 @@ mod tests {
         let baselines = || ["nearest", "aligned", "bow-nearest", "median"].map(|name| of(None, name));
         let with_map = ["fused", "filtered", "smoothed"].map(|name| of(Some("default"), name));
         let in_protocol = ["paper", "default"].map(|recipe| of(Some(recipe), "fused"));
-        for methods in [with_map.into_iter().chain(baselines()).collect::<Vec<_>>(), in_protocol.into_iter().chain(baselines()).collect()] {
+        for methods in [
+            with_map.into_iter().chain(baselines()).collect::<Vec<_>>(),
+            in_protocol.into_iter().chain(baselines()).collect(),
+        ] {
             for (i, a) in methods.iter().enumerate() {
                 for b in &methods[..i] {
                     assert!(a.color != b.color, "{} and {}", a.label, b.label);

@@ -223,8 +223,10 @@ fn put_provenance(page: &mut String, report: &Report) {
         if let Some(map) = &dataset.map {
             let info = &map.info;
             let recordings = info.recordings.iter().map(|r| format!("{} ({})", r.name, counted(r.frames, "frame")));
-            let groups =
-                info.groups.iter().map(|group| format!("{} ({})", group.recipe.descriptor, counted(group.features, "feature")));
+            let groups = info
+                .groups
+                .iter()
+                .map(|group| format!("{} ({})", group.recipe.descriptor, counted(group.features, "feature")));
             let selection = match info.selection {
                 Selection::None => "none",
                 Selection::Backward => "backward elimination",

@@ -7,9 +7,9 @@ use super::chart::svg::escaped;
 use super::dataset::Dataset;
 use super::figures::{RECALL_AT_M, cases, recall_at};
 use super::methods::{Kind, Method, feature_name, methods};
+use crate::evaluate::statistics::{Estimate, p_text};
 use crate::evaluate::{Entry, emax_m};
 use crate::types::counted;
-use crate::evaluate::statistics::{Estimate, p_text};
 
 #[derive(Debug, Clone)]
 pub struct Table {

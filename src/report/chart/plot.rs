@@ -313,7 +313,8 @@ mod tests {
             plot.label([100.0, 50.0], "a row", NOTE.anchored(anchor));
             let panel = plot.finish();
             let text = document(panel.size_px, &panel.shapes, "");
-            let (rect, label) = (text.find(&format!("<rect x=\"{}\"", super::super::svg::px(left - 2.0))), text.find("a row"));
+            let (rect, label) =
+                (text.find(&format!("<rect x=\"{}\"", super::super::svg::px(left - 2.0))), text.find("a row"));
             assert!(rect.is_some() && rect < label, "{text}");
         }
     }

@@ -135,7 +135,9 @@ fn panel(dataset: &Dataset, filtered: &ShownSequence, width_px: f64) -> Panel {
         plot.dot([times[answer.row], answer.error_m().max(low)], 1.6, Paint::fill(MUTED).opacity(0.6));
     }
     let smoothed = dataset.sequences.iter().find(|sequence| sequence.estimator == "smoothed");
-    for (sequence, paint) in [(smoothed, Paint::stroke(SMOOTHED, 1.4).dashed("5 2")), (Some(filtered), Paint::stroke(FILTERED, 2.0))] {
+    for (sequence, paint) in
+        [(smoothed, Paint::stroke(SMOOTHED, 1.4).dashed("5 2")), (Some(filtered), Paint::stroke(FILTERED, 2.0))]
+    {
         for run in sequence.map(|sequence| runs(&sequence.answers)).unwrap_or_default() {
             let points: Vec<_> = run.iter().map(|a| [times[a.row], a.error_m().max(low)]).collect();
             plot.curve(&points, paint);

@@ -81,9 +81,15 @@ fn panel(dataset: &Dataset, of: &WordAssignment, width_px: f64) -> Panel {
     let counts = Counts::of(of);
     let white = |color| Paint::fill(PAPER).outlined(color, 1.8);
     let mut legend = vec![
-        LegendItem::new(format!("test, label right ({})", counts.right), Key::Dot(Paint::fill(BLUE).outlined(INK, 0.8))),
+        LegendItem::new(
+            format!("test, label right ({})", counts.right),
+            Key::Dot(Paint::fill(BLUE).outlined(INK, 0.8)),
+        ),
         LegendItem::new(format!("wrong ({})", counts.wrong), Key::Dot(white(BLUE))),
-        LegendItem::new(format!("learning, line to its label ({})", counts.labelled), Key::Line(Paint::stroke(BLUE, 1.2))),
+        LegendItem::new(
+            format!("learning, line to its label ({})", counts.labelled),
+            Key::Line(Paint::stroke(BLUE, 1.2)),
+        ),
         LegendItem::new(format!("left out ({})", counts.left_out), Key::Dot(Paint::fill(PAPER).outlined(MUTED, 0.9))),
     ];
     let none_of = [false, counts.wrong == 0, false, counts.left_out == 0];
@@ -103,8 +109,12 @@ fn panel(dataset: &Dataset, of: &WordAssignment, width_px: f64) -> Panel {
             plot.dot(position_m, radius_px + wider_px, Paint::fill(color));
         }
     }
-    let color_of: BTreeMap<usize, (PositionM, &str)> =
-        of.test.iter().zip(colors_apart(&positions_m)).map(|(test, color)| (test.index, ([test.e_m, test.n_m], color))).collect();
+    let color_of: BTreeMap<usize, (PositionM, &str)> = of
+        .test
+        .iter()
+        .zip(colors_apart(&positions_m))
+        .map(|(test, color)| (test.index, ([test.e_m, test.n_m], color)))
+        .collect();
     for frame in &of.learning {
         let at_m = [frame.e_m, frame.n_m];
         match frame.label.and_then(|label| color_of.get(&label)) {
