@@ -107,7 +107,8 @@ impl Table {
         for (i, row) in self.rows.iter().enumerate() {
             if let Some(group) = &row.begins_group {
                 let span = self.columns.len() + 1;
-                html += &format!("<tr class=\"split\"><th colspan=\"{span}\">{}</th></tr>", escaped(group));
+                html +=
+                    &format!("<tr class=\"split\"><th colspan=\"{span}\"><span>{}</span></th></tr>", escaped(group));
             }
             let class = if row.is_strong { " class=\"strong\"" } else { "" };
             html += &format!("<tr{class}><th>{}</th>", escaped(&row.label));
