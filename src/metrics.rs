@@ -64,6 +64,20 @@ pub fn component_median(positions: &[PositionM]) -> PositionM {
     })
 }
 
+/// What regions of 95 % are worth that held the true position in the share `covered` of so many frames. Between the verdicts
+/// lies what happens by chance in 95 % of such drives, were their frames independent.
+pub fn coverage_verdict(covered: f64, frames: usize) -> &'static str {
+    const STATED: f64 = 0.95;
+    let by_chance = 1.96 * (STATED * (1.0 - STATED) / frames.max(1) as f64).sqrt();
+    if covered < STATED - by_chance {
+        "over-confident"
+    } else if covered > STATED + by_chance {
+        "too cautious"
+    } else {
+        "as stated"
+    }
+}
+
 pub(crate) fn root_mean_square(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
 }
@@ -100,6 +114,23 @@ mod tests {
         let truth_m = [[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]];
         let figures = ErrorFigures::of(&[[0.0, 0.0]; 3], &truth_m, [0.0, 0.0]).expect("there are estimates");
         assert!(figures.skill.abs() < 1e-12);
+    }
+
+    #[test]
+    fn coverage_is_judged_by_how_many_frames_it_is_of() {
+        // 1.96 deviations are 4.3 % of 100 frames, 1.35 % of 1000.
+        for (covered, frames, expected) in [
+            (0.95, 100, "as stated"),
+            (0.91, 100, "as stated"),
+            (0.91, 1000, "over-confident"),
+            (0.90, 100, "over-confident"),
+            (0.99, 100, "as stated"),
+            (1.0, 100, "too cautious"),
+            (1.0, 20, "as stated"),
+            (0.97, 1000, "too cautious"),
+        ] {
+            assert_eq!(coverage_verdict(covered, frames), expected, "{covered} of {frames}");
+        }
     }
 
     #[test]

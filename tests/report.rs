@@ -11,10 +11,11 @@ use std::{
 
 use common::{TinyDataset, names, omniloc, run};
 use serde_json::Value;
+use sha2::{Digest, Sha256};
 use tempfile::TempDir;
 
-/// A name that wants to be more than text.
-const HOSTILE: &str = "yard <script>alert(1)</script> & \"quotes\"";
+/// A name that wants to be more than text, in a page and on a terminal.
+const HOSTILE: &str = "yard <script>alert(1)</script> & \"quotes\" \u{1b}[31m\u{7}\u{9b}2J";
 
 /// A report of the protocol, on the sample's first photographs under a hostile name, and the folder it lies in.
 fn protocol_report() -> PathBuf {
@@ -29,6 +30,9 @@ fn protocol_report() -> PathBuf {
             .args(["--features", "sp", "--seeds", "2", "--variants", "plain", "--grid-step-m", "1", "--report"])
             .arg(&report));
         assert_eq!(code, 0, "{stderr}");
+        let is_harmless = |text: &str| text.chars().all(|character| character == '\n' || !character.is_control());
+        assert!(is_harmless(&stdout) && is_harmless(&stderr), "{stdout:?}{stderr:?}");
+        assert!(stdout.contains("yard <script>") && stdout.contains("\u{fffd}[31m"), "{stdout}");
         assert!(stdout.contains("report/index.html") && stderr.contains("report: drawing"), "{stdout}{stderr}");
         folder
     });
@@ -167,6 +171,10 @@ fn every_table_cell_is_the_number_in_the_json() {
                 assert!(value.is_null() && text == "–", "{path}: {value} is written {text}");
                 continue;
             };
+            if let Some(bound) = text.strip_prefix("&lt; ") {
+                assert!(value < bound.parse().expect("a number"), "{path}: {value} is written {text}");
+                continue;
+            }
             let plain = text.replace('−', "-").replace(['\u{a0}', '%', ' '], "");
             let plain = plain.split('(').next().unwrap_or_default();
             let shown: f64 = plain.parse().unwrap_or_else(|_| panic!("{path}: {text}"));
@@ -206,6 +214,81 @@ fn what_is_drawn_is_what_the_results_say() {
     assert_eq!(dataset["map"]["info"]["recordings"][0]["frames"], 120);
 }
 
+/// Whether the stated uncertainty keeps its promise is said in words, by the numbers that are drawn.
+#[test]
+fn the_page_says_whether_coverage_is_as_stated() {
+    let (page, json) = (page(&map_report()), json(&map_report()));
+    let series = json["figures"]["corridor-7-day-2-reliability"]["data"].as_array().expect("a list");
+    assert!(series.len() >= 2, "{series:?}");
+    for one in series {
+        let [estimates, verdict] = ["estimates", "verdict"].map(|key| one[key].as_str().expect("a text"));
+        assert!(["over-confident", "too cautious", "as stated"].contains(&verdict), "{verdict}");
+        assert!(page.contains(&format!("({estimates}: {verdict})")), "{estimates} {verdict}");
+    }
+}
+
+/// Every file that was read is named with its checksum: recording, map, and what the map was learned from.
+#[test]
+fn the_files_that_were_read_are_on_the_page_with_their_checksums() {
+    let (page, json) = (page(&map_report()), json(&map_report()));
+    let inputs = json["inputs"].as_array().expect("a list");
+    let roles: Vec<_> = inputs.iter().map(|input| input["role"].as_str().expect("a text")).collect();
+    assert_eq!(roles, ["recording", "map", "survey"]);
+    for input in inputs {
+        let [file, sha256] = ["file", "sha256"].map(|key| input[key].as_str().expect("a text"));
+        let bytes = fs::read(file).expect("it is still there");
+        let expected: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        assert_eq!(sha256, expected, "{file}");
+        assert!(page.contains(&format!("<td>{file}</td><td><code>{sha256}</code></td>")), "{file}");
+    }
+}
+
+/// Every line of figure 6 leads from a learning image to the test image whose label it carries.
+#[test]
+fn the_words_figure_draws_the_assignment_of_every_image() {
+    let (report, json) = (protocol_report(), json(&protocol_report()));
+    let figures = json["figures"].as_object().expect("figures by name");
+    let (id, figure) = figures.iter().find(|(id, _)| id.ends_with("-words")).expect("the figure of the words");
+    let mut labelled = 0;
+    for panel in figure["data"].as_array().expect("panels") {
+        let list = |key: &str| panel[key].as_array().expect("a list").clone();
+        let counts = |key: &str| panel["counts"][key].as_u64().expect("a number") as usize;
+        let of_panel = list("learning").iter().filter(|frame| !frame["label"].is_null()).count();
+        assert_eq!(counts("learning_labelled"), of_panel);
+        assert_eq!(counts("learning_left_out"), list("learning").len() - of_panel);
+        let right = list("test").iter().filter(|test| test["index"] == test["predicted"]).count();
+        assert_eq!((counts("test_right"), counts("test_wrong")), (right, list("test").len() - right));
+        labelled += of_panel;
+    }
+    let svg = fs::read_to_string(report.join(format!("figures/{id}.svg"))).expect("readable");
+    let lines = svg.matches("stroke-width=\"1.2\"").count();
+    // And one in the legend of every panel.
+    assert_eq!(lines, labelled + figure["data"].as_array().expect("panels").len());
+    // What overlaps hides what is below it, and does not add up.
+    assert!(!svg.contains("opacity"), "{id}");
+}
+
+/// Every split has its worst frames, the largest errors of the headline method in it.
+#[test]
+fn the_gallery_shows_the_worst_frames_of_every_split() {
+    let (report, json) = (protocol_report(), json(&protocol_report()));
+    let galleries = json["worst_frames"].as_object().expect("by dataset").values().next().expect("a dataset");
+    let galleries = galleries.as_array().expect("one a split");
+    let splits: Vec<_> = galleries.iter().map(|gallery| gallery["split"].as_str().expect("a name")).collect();
+    assert_eq!(splits, ["random", "blocked"]);
+    for gallery in galleries {
+        let number = |value: &Value| value.as_f64().expect("a number");
+        let of_split = |entry: &&Value| entry["split"] == gallery["split"] && entry["recipe"] == "default";
+        let rows = json["datasets"][0]["results"].as_array().expect("a list");
+        let worst = rows.iter().filter(of_split).map(|row| number(&row["emax_test_m"])).fold(0.0, f64::max);
+        let frames = gallery["frames"].as_array().expect("a list");
+        let errors_m: Vec<f64> = frames.iter().map(|frame| number(&frame["error_m"])).collect();
+        assert!(errors_m.len() == 4 && errors_m.is_sorted_by(|a, b| a >= b) && (errors_m[0] - worst).abs() < 1e-9);
+        assert!(frames.iter().all(|frame| frame["nearest_learning_image"]["index"].is_number()));
+    }
+    assert_eq!(page(&report).matches("<article class=\"worst\">").count(), 8);
+}
+
 fn panels_frames(panels: &Value) -> usize {
     panels.as_array().expect("panels").iter().map(|panel| panel["frames"].as_array().expect("frames").len()).sum()
 }
@@ -225,7 +308,11 @@ fn the_page_fetches_nothing_and_believes_no_name() {
         assert!(page.contains("default-src 'none'"));
     }
     let hostile = page(&protocol_report());
-    assert!(hostile.contains("yard &lt;script&gt;alert(1)&lt;\u{2215}script&gt; &amp; &quot;quotes&quot;"));
+    assert!(hostile.contains(
+        "yard &lt;script&gt;alert(1)&lt;\u{2215}script&gt; &amp; &quot;quotes&quot; \u{fffd}[31m\u{fffd}\u{fffd}2J"
+    ));
+    let is_text = |character: char| matches!(character, '\n' | '\t') || !character.is_control();
+    assert!(hostile.chars().all(is_text), "control characters on the page");
 }
 
 #[test]
@@ -241,6 +328,28 @@ fn a_report_replaces_only_a_report_and_only_when_told() {
     let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--report").arg(protocol_report()));
     assert!(code == 2 && stderr.contains("--force"), "{code} {stderr}");
     assert!(fs::read(protocol_report().join("index.html")).expect("readable") == before);
+}
+
+/// What cannot be written is said before the work, and nothing is left of it.
+#[test]
+fn a_folder_that_cannot_hold_the_report_is_refused_at_the_start() {
+    let dataset = TinyDataset::new();
+    let recording = dataset.import("rec.mcap");
+    let evaluate = |arguments: &[&str]| {
+        run(omniloc().current_dir(dataset.temporary.path()).arg("evaluate").arg(&recording).args(arguments))
+    };
+    // No folder can be made there, not even by root.
+    let (code, _, stderr) = evaluate(&["--report", "/proc/report"]);
+    assert!(code == 2 && stderr.contains("cannot make this folder") && !stderr.contains("reading"), "{code} {stderr}");
+    let (code, _, stderr) = evaluate(&["--report", "/proc/self"]);
+    assert!(code == 2 && !stderr.contains("reading frames"), "{code} {stderr}");
+    for json in ["there", "there/results.json", "./there/../there/results.json", "there/more/results.json"] {
+        let (code, _, stderr) = evaluate(&["--report", "there", "--json", json]);
+        assert!(code == 2 && stderr.contains("lies in the folder of the report"), "{json}: {code} {stderr}");
+    }
+    // Five frames are too few to learn from: what was begun is taken back.
+    let (code, ..) = evaluate(&["--report", "there"]);
+    assert!(code != 0 && !dataset.path("there").exists(), "{code}");
 }
 
 /// A program of Debian's chromium package.
@@ -265,6 +374,7 @@ fn a_browser_shows_it_without_complaint_on_a_desk_and_on_a_telephone() {
         for found in widths {
             let none = |key: &str| found[key].as_array().expect("a list").is_empty();
             assert!(none("complaints") && none("requests") && none("sticking") && none("lost"), "{found}");
+            assert!(none("silent"), "{found}");
             assert_eq!((&found["wide"], &found["broken"]), (&Value::from(0), &Value::from(0)), "{found}");
             assert!(found["pictures"].as_u64() >= Some(10) && found["figures"].as_u64() >= Some(8), "{found}");
             // Nine pixels are what small print in a newspaper is.

@@ -149,6 +149,48 @@ fn the_protocol_runs_with_both_recipes_and_a_split_from_a_file() {
     assert!(rows[1]["n_learned_from"] == 18, "the default recipe refits: {}", rows[1]);
 }
 
+/// A drive along its yaw: smoothing moves its positions, and evaluate says how far.
+#[test]
+fn it_is_said_how_far_smoothing_moved_the_positions() {
+    let folder = folder();
+    let (dataset, recording) = (folder.path().join("town"), folder.path().join("town.mcap"));
+    omniloc()
+        .args(["simulate", "--world", "town", "--frames", "60", "--size", "320x180", "--out"])
+        .arg(&dataset)
+        .assert()
+        .success();
+    omniloc().arg("import").arg(&dataset).arg("--out").arg(&recording).assert().success();
+    let results = folder.path().join("results.json");
+    let (code, stdout, stderr) = run(omniloc()
+        .arg("evaluate")
+        .arg(&recording)
+        .args([
+            "--features",
+            "gradient",
+            "--recipe",
+            "default",
+            "--seeds",
+            "2",
+            "--split",
+            "random",
+            "--grid-step-m",
+            "5",
+        ])
+        .args(["--variants", "plain", "--baselines", "none", "--json"])
+        .arg(&results));
+    assert_eq!(code, 0, "{stderr}");
+    let said = "positions of town-1-day-1 that the default recipe learned from: moved by smoothing, by ";
+    assert!(stdout.contains(said) && stdout.contains("m (root mean square, over 2 trials), frame "), "{stdout}");
+    let results: serde_json::Value = serde_json::from_slice(&fs::read(results).expect("written")).expect("JSON");
+    let shifts = results["position_shifts"].as_array().expect("a list");
+    assert_eq!(shifts.len(), 2);
+    for shift in shifts {
+        let [rms_m, largest_m] = ["rms_m", "largest_m"].map(|key| shift[key].as_f64().expect(key));
+        assert!(0.0 < rms_m && rms_m < largest_m && shift["frames"] == 45, "{shift}");
+        assert!(shift["track"]["smoothed"]["receiver_std_m"].is_number(), "{shift}");
+    }
+}
+
 #[test]
 fn what_cannot_be_trained_is_refused_and_leaves_nothing() {
     let row = |index: usize, place: &str| format!("{index},{index:04}.jpg,{place},,");
@@ -287,6 +329,11 @@ fn no_output_may_be_an_input_and_arguments_that_contradict_are_refused() {
         vec!["evaluate", path, "--json", "/dev/null"],
         vec!["evaluate", path, "--map", "x.map", "--seeds", "2"],
         vec!["evaluate", path, "--split", "random,random"],
+        vec!["evaluate", path, "--split", "nowhere.csv"],
+        vec!["evaluate", path, "--split", "."],
+        vec!["evaluate", path, "--truth", "nowhere.csv"],
+        vec!["evaluate", path, "--truth", "."],
+        vec!["evaluate", path, "--map", "."],
         vec!["evaluate", path, "--seed", "18446744073709551615", "--seeds", "2"],
     ] {
         let (code, _, stderr) = run(omniloc().args(&arguments).current_dir(folder.path()));
@@ -322,6 +369,50 @@ fn a_bad_split_or_truth_names_its_line() {
     fs::write(&truth, "index,x_m,y_m\n0,1,2\n1,NaN,3\n").expect("writes");
     let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&recording).arg("--truth").arg(&truth));
     assert!(code == 1 && stderr.contains("truth.csv: line 3: x_m is `NaN`"), "{stderr}");
+    // As of any other file that holds something else.
+    let (code, _, stderr) = run(omniloc().arg("evaluate").arg(&split));
+    assert!(code == 1 && stderr.contains("not an MCAP recording"), "{stderr}");
+}
+
+#[test]
+fn a_truth_of_another_place_is_warned_about() {
+    let folder = folder();
+    let recording = recording(&folder, 24);
+    let rows = fs::read_to_string(sample().join("positions.csv")).expect("the sample is shipped");
+    for (east_m, is_doubtful) in [(8.0, false), (1200.0, true)] {
+        let lines = rows.lines().skip(1).take(24).map(|line| {
+            let fields: Vec<&str> = line.split(',').collect();
+            format!("{},{},{}\n", fields[0], fields[2].parse::<f64>().expect("a number") + east_m, fields[3])
+        });
+        let truth = folder.path().join("truth.csv");
+        fs::write(&truth, format!("index,x_m,y_m\n{}", lines.collect::<String>())).expect("writes");
+        let results = folder.path().join("results.json");
+        let (code, _, stderr) = run(omniloc()
+            .arg("evaluate")
+            .arg(&recording)
+            .args([
+                "--features",
+                "gradient",
+                "--recipe",
+                "default",
+                "--seeds",
+                "1",
+                "--split",
+                "random",
+                "--grid-step-m",
+                "10",
+            ])
+            .args(["--variants", "plain", "--baselines", "none", "--force", "--truth"])
+            .arg(&truth)
+            .arg("--json")
+            .arg(&results));
+        assert_eq!(code, 0, "{stderr}");
+        assert_eq!(stderr.contains("more than 1200.0 m from the recorded ones"), is_doubtful, "{stderr}");
+        let results: serde_json::Value = serde_json::from_slice(&fs::read(results).expect("written")).expect("JSON");
+        assert_eq!(results["warnings"].as_array().expect("a list").len(), usize::from(is_doubtful));
+        let roles: Vec<_> = results["inputs"].as_array().expect("a list").iter().map(|input| &input["role"]).collect();
+        assert_eq!(roles, ["recording", "truth"]);
+    }
 }
 
 /// Set by `tests/run`: a Python with the packages of `tests/python/requirements.txt`.

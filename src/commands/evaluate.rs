@@ -6,22 +6,25 @@ use std::process::ExitCode;
 use anyhow::Context;
 use serde_json::json;
 
-use super::options::{OutputKind, check_input, check_not_input, check_output, command_line};
+use super::evaluate_map::on_map;
+use super::inputs::inputs;
+use super::options::{OutputKind, check_input, check_no_folder, check_not_input, check_output, command_line, resolved};
 use super::progress::Progress;
 use super::reporter::Reporter;
 use super::survey::{
-    bad_argument, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_to_match, read_truth,
+    bad_argument, elsewhere, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_truth,
 };
-use super::{BadArgument, DONE, print};
-use crate::evaluate::baselines::{Baseline, BaselineRows, Views};
+use super::{BadArgument, DONE, print, printable};
+use crate::evaluate::baselines::{Baseline, Views};
 use crate::evaluate::{
-    Case, Entry, Evaluation, LEGEND, MapComparison, Protocol, Statistics, Variant, map_entries, statistics, table,
+    Case, Entry, Evaluation, LEGEND, PositionShift, Protocol, Statistics, Variant, statistics, table,
 };
 use crate::features::Descriptor;
-use crate::map::{FeatureMap, Recipe, RecipeName, Selection, Smoothing, SplitKind, file};
+use crate::map::{Recipe, RecipeName, Selection, Smoothing, SplitKind};
+use crate::metrics::coverage_verdict;
 use crate::recording::{Recording, write_bytes_atomically};
 use crate::train::{Outcomes, Similarity, Split, Survey, TrackSmoother, Trial};
-use crate::types::PositionM;
+use crate::types::counted;
 
 /// Measure how well the method localizes on recordings
 ///
@@ -132,6 +135,14 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
             return Err(refused("goes with no other").into());
         }
     }
+    for file in args.map.iter().chain(&args.truth) {
+        check_input(file)?;
+        check_no_folder(file)?;
+    }
+    for split in args.split.iter().filter(|split| !matches!(split.as_str(), "random" | "blocked")) {
+        let is_file = check_input(Path::new(split)).and_then(|()| check_no_folder(Path::new(split)));
+        is_file.with_context(|| format!("--split {split}: neither random nor blocked nor a file"))?;
+    }
     if args.truth.is_some() && args.recordings.len() > 1 {
         return Err(BadArgument("--truth goes with one recording".into()).into());
     }
@@ -139,6 +150,14 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         check_output(json, OutputKind::File, args.force)?;
         let inputs = args.recordings.iter().chain(&args.map).chain(&args.truth).chain(&args.survey);
         check_not_input(json, inputs)?;
+        if let Some(report) = args.report.as_ref().filter(|report| resolved(json).starts_with(resolved(report))) {
+            let (json, report) = (json.display(), report.display());
+            return Err(BadArgument(format!(
+                "--json {json}: lies in the folder of the report, {report}, which holds a report and nothing else; choose \
+                 another name"
+            ))
+            .into());
+        }
         let folder = json.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if !folder.is_dir() {
             return Err(
@@ -153,6 +172,12 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         args.report.as_ref().map(|folder| Reporter::new(folder, args.force, settings(args))).transpose()?;
     let progress = Progress::new();
     let mut all = Evaluation::default();
+    if args.json.is_some() || reporter.is_some() {
+        all.inputs = inputs(args)?;
+    }
+    if let Some(reporter) = &mut reporter {
+        reporter.take_inputs(&all.inputs);
+    }
     for (number, recording) in recordings.iter().enumerate() {
         let evaluation = match &args.map {
             Some(path) => on_map(args, path, recording, reporter.as_mut(), &progress)?,
@@ -161,15 +186,18 @@ pub fn evaluate(args: &Args) -> anyhow::Result<Evaluation> {
         if let Some(reporter) = &mut reporter {
             reporter.take_evaluation(&evaluation);
         }
-        let Evaluation { entries, statistics, assignments } = evaluation;
+        let Evaluation { entries, statistics, assignments, shifts, warnings, .. } = evaluation;
         progress.finish();
-        print(&format!("\nTable {}: {}\n{}", number + 1, recording.name, table(&entries)))?;
+        print(&format!("\nTable {}: {}\n{}", number + 1, printable(&recording.name), table(&entries)))?;
         print(&in_words(&entries))?;
+        PositionShift::lines(&shifts).iter().try_for_each(|line| print(&format!("{}\n", printable(line))))?;
         print(&statistics::text(&statistics))?;
         all.entries.extend(entries);
         all.statistics.methods.extend(statistics.methods);
         all.statistics.comparisons.extend(statistics.comparisons);
         all.assignments.extend(assignments);
+        all.shifts.extend(shifts);
+        all.warnings.extend(warnings);
     }
     print(&format!("\n{LEGEND}\n{}", statistics::LEGEND))?;
     if let Some(reporter) = reporter {
@@ -225,13 +253,16 @@ fn in_words(entries: &[Entry]) -> String {
             text += "filtered: not sure of the position in any frame, so there are no errors to speak of\n";
         }
         let Some(covered) = entry.coverage_95 else { continue };
+        let frames = entry.frames.iter().flatten().filter(|frame| frame.est_e_m.is_some()).count();
         text += &format!(
-            "{}: the region of 95 % holds the true position in {:.1} % of the frames",
+            "{}: the region of 95 % holds the true position in {:.1} % of {}: {}",
             entry.estimator,
-            100.0 * covered
+            100.0 * covered,
+            counted(frames, "frame"),
+            coverage_verdict(covered, frames)
         );
         if let Some(nees) = entry.nees_mean {
-            text += &format!(", mean NEES {nees:.2} (2 is exact)");
+            text += &format!("; mean NEES {nees:.2} (2 is exact)");
         }
         if let Some(heading_deg) = entry.heading_median_deg {
             text += &format!("; heading off by {heading_deg:.1} deg (median)");
@@ -246,116 +277,13 @@ fn in_words(entries: &[Entry]) -> String {
     text
 }
 
-/// Every frame of `recording` against a map.
-fn on_map(
-    args: &Args,
-    path: &Path,
-    recording: &Recording,
-    reporter: Option<&mut Reporter>,
-    progress: &Progress,
-) -> anyhow::Result<Evaluation> {
-    let map = open_map(path)?;
-    if map.info.recordings.iter().any(|trained_on| trained_on.name == recording.name) {
-        eprintln!("warning: the map was trained on {}: it knows these frames, and the errors flatter", recording.name);
-    }
-    let descriptors = map.info.groups.iter().map(|group| group.recipe.descriptor).collect();
-    let recording = moved_to(&map, path, recording.clone())?;
-    let survey = read_to_match(&recording, descriptors, progress)?;
-    map.info
-        .check_lens(&survey.calibration, survey.image_size_px)
-        .with_context(|| format!("{} against {}", recording.path.display(), path.display()))?;
-    let truth_m = truth(args, &survey)?;
-    let mut entries = map_entries(&recording.name, &survey, &map, &truth_m);
-    let learned = if args.survey.is_empty() { Vec::new() } else { open_surveys(args, path, &map)? };
-    if let Some(reporter) = reporter {
-        progress.begin("report: what the map knows", 1);
-        reporter.begin(&recording, &survey, &truth_m)?;
-        reporter.take_map(&survey, path, &map, &learned)?;
-    }
-
-    let mut rows = BaselineRows::default();
-    let comparison = MapComparison { dataset: &recording.name, survey: &survey, map: &map, truth_m: &truth_m };
-    if args.baselines.contains(&Baseline::Nearest) {
-        comparison.add_nearest(&mut rows);
-    }
-    let compare_images: Vec<&str> =
-        args.baselines.iter().filter(|baseline| baseline.compares_images()).map(|baseline| baseline.name()).collect();
-    if !compare_images.is_empty() && args.survey.is_empty() {
-        let names = compare_images.join(", ");
-        eprintln!(
-            "note: no rows for {names}: a map holds features, not images; --survey names the recordings it is of"
-        );
-    } else if !compare_images.is_empty() {
-        let views = read_views(&learned.iter().chain([&recording]).collect::<Vec<_>>(), args, false, progress)?;
-        progress.begin("baselines", 1);
-        comparison.add_views(&mut rows, &learned, &views);
-    }
-    comparison.add_median(&mut rows);
-    rows.notes.iter().for_each(|note| progress.say(&format!("note: {note}")));
-    entries.extend(rows.entries);
-    let statistics = Statistics::of(&entries);
-    Ok(Evaluation { entries, statistics, assignments: rows.assignments })
-}
-
-/// `recording` with its positions counted from the map's origin.
-fn moved_to(map: &FeatureMap, path: &Path, mut recording: Recording) -> anyhow::Result<Recording> {
-    if let Some(origin) = map.info.origin
-        && !recording.move_origin(origin)
-    {
-        anyhow::bail!(
-            "{}: does not know where on the Earth it lies, but {} does: positions cannot be compared; import it with \
-             --origin",
-            recording.path.display(),
-            path.display()
-        );
-    }
-    Ok(recording)
-}
-
-/// The recordings that a map was made of.
-fn open_surveys(args: &Args, path: &Path, map: &FeatureMap) -> anyhow::Result<Vec<Recording>> {
-    let recordings = open_recordings(&args.survey, None)?;
-    for recording in &recordings {
-        if !map.info.recordings.iter().any(|learned| learned.name == recording.name) {
-            let of: Vec<&str> = map.info.recordings.iter().map(|learned| learned.name.as_str()).collect();
-            eprintln!(
-                "warning: {} was learned from {}, not from --survey {}: the baselines learn from another drive",
-                path.display(),
-                of.join(", "),
-                recording.name
-            );
-        }
-    }
-    let frames: usize = recordings.iter().map(|recording| recording.survey.len()).sum();
-    if frames != map.positions_m.len() {
-        eprintln!(
-            "warning: {} was learned from {} frames, --survey has {frames}: the baselines do not learn from the same",
-            path.display(),
-            map.positions_m.len()
-        );
-    }
-    let moved = recordings.into_iter().map(|recording| {
-        map.info
-            .check_lens(&recording.calibration()?, map.info.image_size_px.into())
-            .with_context(|| format!("--survey {}", recording.path.display()))?;
-        moved_to(map, path, recording)
-    });
-    moved.collect()
-}
-
 /// Reads what the baselines that compare images need of all frames of `recordings`.
-fn read_views(recordings: &[&Recording], args: &Args, fixed: bool, progress: &Progress) -> anyhow::Result<Views> {
+pub fn read_views(recordings: &[&Recording], args: &Args, fixed: bool, progress: &Progress) -> anyhow::Result<Views> {
     let frames = recordings.iter().map(|recording| recording.survey.len()).sum();
     if args.baselines.iter().any(|baseline| baseline.compares_images()) {
         progress.begin(if fixed { "reading views, turned by their yaw" } else { "reading views" }, frames);
     }
     Ok(Views::read(recordings, &args.baselines, fixed, |frames| progress.advance(frames))?)
-}
-
-pub fn open_map(path: &Path) -> anyhow::Result<FeatureMap> {
-    check_input(path)?;
-    let reader = std::fs::File::open(path).with_context(|| format!("opening the map {}", path.display()))?;
-    file::read(reader).with_context(|| format!("loading the map {}", path.display()))
 }
 
 /// The paper's protocol on one recording.
@@ -381,7 +309,8 @@ fn protocol(
     let has_yaws = plain.frames.iter().all(|frame| frame.yaw_rad.is_some());
     let fixed = if wants_fixed && has_yaws { Some(read_all(true)?) } else { None };
     if wants_fixed && fixed.is_none() {
-        eprintln!("note: {}: not every frame has a yaw; there are no (fixed) rows", recording.name);
+        let name = printable(&recording.name);
+        eprintln!("note: {name}: not every frame has a yaw; there are no (fixed) rows");
     }
     let exact_m = args.truth.as_ref().map(|path| read_truth(path, &plain)).transpose()?;
     let smooths = |recipe: &Recipe| args.smooth.unwrap_or(Smoothing::usual(recipe.name)) == Smoothing::Track;
@@ -398,9 +327,13 @@ fn protocol(
         baselines: &args.baselines,
     };
     if let Some(reporter) = &mut reporter {
-        reporter.begin(recording, &plain, exact_m.as_ref().unwrap_or(&plain.positions_m()))?;
+        reporter.begin(recording, &plain, exact_m.as_ref().unwrap_or(&plain.positions_m()));
     }
-    let mut all = Evaluation::default();
+    let doubtful = args.truth.as_ref().zip(exact_m.as_ref());
+    let warnings: Vec<String> =
+        doubtful.and_then(|(path, truth_m)| elsewhere(path, truth_m, &plain)).into_iter().collect();
+    warnings.iter().for_each(|warning| eprintln!("warning: {}", printable(warning)));
+    let mut all = Evaluation { warnings, ..Evaluation::default() };
     for case in cases(args, &plain)? {
         let (survey, views) = match (case.variant, &fixed) {
             (Variant::Fixed, Some((survey, views))) => (survey, views),
@@ -426,6 +359,7 @@ fn protocol(
             progress.say(&format!("note: {note}"));
         }
         all.entries.extend(results.entries);
+        all.shifts.extend(results.shifts);
         all.entries.extend(rows.entries);
         all.assignments.extend(rows.assignments);
     }
@@ -451,8 +385,6 @@ fn cases(args: &Args, survey: &Survey) -> anyhow::Result<Vec<Case>> {
             "random" => SplitKind::Random,
             "blocked" => SplitKind::Blocked,
             path => {
-                check_input(Path::new(path))
-                    .with_context(|| format!("--split {path}: neither random nor blocked nor a file"))?;
                 let indices: Vec<usize> = survey.frames.iter().map(|frame| frame.index).collect();
                 let file = std::fs::File::open(path).with_context(|| format!("opening the split {path}"))?;
                 let split = Split::from_csv(file, &indices).with_context(|| format!("reading the split {path}"))?;
@@ -471,13 +403,6 @@ fn cases(args: &Args, survey: &Survey) -> anyhow::Result<Vec<Case>> {
     Ok(cases)
 }
 
-fn truth(args: &Args, survey: &Survey) -> anyhow::Result<Vec<PositionM>> {
-    match &args.truth {
-        Some(path) => read_truth(path, survey),
-        None => Ok(survey.positions_m()),
-    }
-}
-
 fn write_json(path: &Path, args: &Args, mut evaluation: Evaluation) -> anyhow::Result<()> {
     let command = command_line();
     let datasets: Vec<String> = args.recordings.iter().map(|path| path.display().to_string()).collect();
@@ -488,8 +413,11 @@ fn write_json(path: &Path, args: &Args, mut evaluation: Evaluation) -> anyhow::R
         "program": env!("CARGO_PKG_VERSION"),
         "command": command,
         "datasets": datasets,
+        "inputs": evaluation.inputs,
+        "warnings": evaluation.warnings,
         "results": evaluation.entries,
         "statistics": evaluation.statistics,
+        "position_shifts": evaluation.shifts,
     });
     if args.frames {
         object["assignments"] = json!(evaluation.assignments);

@@ -5,11 +5,11 @@ use std::{path::PathBuf, process::ExitCode};
 use super::{
     BadArgument, DONE,
     options::{OutputKind, check_input, check_output, parse_origin},
-    print,
+    print, printable,
 };
 use crate::{
     recording::{CalibrationSource, ImportSettings, import},
-    types::Geodetic,
+    types::{Geodetic, counted},
 };
 
 /// Turn a folder of images and positions into a recording
@@ -53,14 +53,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         eprintln!("warning: {warning}");
     }
     if report.completed_frames > 0 {
-        eprintln!("note: {} frames came without Huffman tables; the standard ones were added", report.completed_frames);
+        let frames = counted(report.completed_frames, "frame");
+        eprintln!("note: {frames} came without Huffman tables; the standard ones were added");
     }
     let (width_px, height_px) = report.image_size_px;
     print(&format!(
-        "{}: {} frames of {width_px} x {height_px} px from {}\n",
+        "{}: {} of {width_px} x {height_px} px from {}\n",
         args.out.display(),
-        report.frames,
-        report.name
+        counted(report.frames, "frame"),
+        printable(&report.name)
     ))?;
     Ok(DONE.into())
 }

@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::{
     DONE,
-    evaluate::open_map,
+    evaluate_map::open_map,
     file_kind::{FileKind, file_kind},
     map_report,
     options::{check_input, check_no_folder},

@@ -8,6 +8,7 @@ use super::printable;
 use crate::map::{FeatureMap, GroupHyperparameters, TrackReport};
 use crate::metrics::ErrorFigures;
 use crate::train::UpdateReport;
+use crate::types::counted;
 
 pub fn as_json(path: &Path, map: &FeatureMap, size_bytes: u64) -> serde_json::Value {
     json!({
@@ -22,7 +23,7 @@ pub fn as_json(path: &Path, map: &FeatureMap, size_bytes: u64) -> serde_json::Va
 
 /// What adding a drive did to a map.
 pub fn of_update(report: &UpdateReport) -> String {
-    let mut text = format!("added           {} frames\n", report.frames);
+    let mut text = format!("added           {}\n", counted(report.frames, "frame"));
     if let Some(track) = &report.track {
         text += &format!("positions       {}\n", positions(track));
     }
@@ -54,7 +55,7 @@ pub fn as_text(path: &Path, map: &FeatureMap, size_bytes: u64) -> String {
         ("size", format!("{:.1} MB", size_bytes as f64 * 1e-6)),
     ];
     for recording in &info.recordings {
-        lines.push(("trained on", format!("{}, {} frames", recording.name, recording.frames)));
+        lines.push(("trained on", format!("{}, {}", recording.name, counted(recording.frames, "frame"))));
         if let Some(track) = &recording.track {
             lines.push(("positions", positions(track)));
         }

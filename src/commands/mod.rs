@@ -6,11 +6,13 @@ pub mod completions;
 pub mod demo;
 pub mod doctor;
 pub mod evaluate;
+mod evaluate_map;
 pub mod export;
 pub mod file_kind;
 pub mod frame_source;
 pub mod import;
 pub mod info;
+mod inputs;
 pub mod journal;
 pub mod localize;
 pub mod man;
@@ -21,6 +23,8 @@ pub mod progress;
 pub mod record;
 pub mod recover;
 pub mod replay;
+#[cfg(feature = "report")]
+mod report_folder;
 #[cfg(feature = "report")]
 mod reporter;
 #[cfg(not(feature = "report"))]
@@ -39,7 +43,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 /// Done.
 pub const DONE: u8 = 0;
-/// The command could not do its work.
+/// The command could not do its work: what a file holds, be it a recording, a map or a CSV, is part of that.
 pub const FAILED: u8 = 1;
 /// Bad arguments or a bad configuration file.
 pub const BAD_ARGUMENTS: u8 = 2;

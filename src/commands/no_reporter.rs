@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::BadArgument;
 use super::progress::Progress;
-use crate::evaluate::{Case, Evaluation};
+use crate::evaluate::{Case, Evaluation, InputFile};
 use crate::map::FeatureMap;
 use crate::recording::Recording;
 use crate::train::{Outcomes, Survey, Trial};
@@ -20,7 +20,11 @@ impl Reporter {
         Err(BadArgument(text.into()).into())
     }
 
-    pub fn begin(&mut self, _: &Recording, _: &Survey, _: &[PositionM]) -> anyhow::Result<()> {
+    pub fn take_inputs(&mut self, _: &[InputFile]) {
+        match *self {}
+    }
+
+    pub fn begin(&mut self, _: &Recording, _: &Survey, _: &[PositionM]) {
         match *self {}
     }
 
@@ -28,7 +32,7 @@ impl Reporter {
         match *self {}
     }
 
-    pub fn take_map(&mut self, _: &Survey, _: &Path, _: &FeatureMap, _: &[Recording]) -> anyhow::Result<()> {
+    pub fn take_map(&mut self, _: &Survey, _: &Path, _: &FeatureMap, _: &[Recording]) {
         match *self {}
     }
 

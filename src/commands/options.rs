@@ -113,6 +113,23 @@ pub fn check_output(out: &Path, kind: OutputKind, force: bool) -> Result<(), Bad
     }
 }
 
+/// `path`, which need not be there, without links and detours.
+pub fn resolved(path: &Path) -> PathBuf {
+    let Ok(absolute) = std::path::absolute(path) else { return path.into() };
+    let mut rest = PathBuf::new();
+    let mut there = absolute.as_path();
+    loop {
+        match (fs::canonicalize(there), there.parent(), there.file_name()) {
+            (Ok(there), ..) => return if rest.as_os_str().is_empty() { there } else { there.join(rest) },
+            (Err(_), Some(parent), Some(name)) => {
+                rest = if rest.as_os_str().is_empty() { name.into() } else { Path::new(name).join(rest) };
+                there = parent;
+            }
+            _ => return absolute,
+        }
+    }
+}
+
 /// Refuses an output that is one of the inputs, under whatever name.
 pub fn check_not_input<'a>(out: &Path, inputs: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), BadArgument> {
     let Ok(target) = fs::canonicalize(out) else { return Ok(()) };
@@ -129,6 +146,18 @@ pub fn check_not_input<'a>(out: &Path, inputs: impl IntoIterator<Item = &'a Path
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_place_under_several_names_is_one() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let real = folder.path().join("real");
+        fs::create_dir(&real).expect("a folder");
+        std::os::unix::fs::symlink(&real, folder.path().join("link")).expect("a link");
+        let expected = fs::canonicalize(&real).expect("it is there").join("not/yet.json");
+        for name in ["real/not/yet.json", "link/not/yet.json", "real/../link/./not/yet.json"] {
+            assert_eq!(resolved(&folder.path().join(name)), expected, "{name}");
+        }
+    }
 
     #[test]
     fn origins_are_read_or_refused() {

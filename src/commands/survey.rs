@@ -11,7 +11,7 @@ use crate::features::Descriptor;
 use crate::map::{PERTURBED_COPIES, Recipe};
 use crate::recording::Recording;
 use crate::train::{Survey, SurveyOptions, TrialError};
-use crate::types::{NS_PER_S, PositionM, distance_m};
+use crate::types::{NS_PER_S, PositionM, counted, distance_m};
 
 /// Learning takes time with the third power of the number of frames: more than this many are thinned out.
 const MAX_FRAMES: usize = 800;
@@ -108,7 +108,8 @@ fn open_all(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
             let recording = Recording::open(path)?;
             let unusable = recording.unusable.len();
             if unusable > 0 {
-                eprintln!("note: {}: {unusable} frames without a usable position are left out", path.display());
+                let frames = counted(unusable, "frame");
+                eprintln!("note: {}: left out for want of a usable position: {frames}", path.display());
             }
             Ok(recording)
         })
@@ -206,9 +207,29 @@ pub fn read_truth(path: &std::path::Path, survey: &Survey) -> anyhow::Result<Vec
         survey.frames.iter().map(|frame| of_frame(frame.index)).collect::<anyhow::Result<_>>()?;
     if truth.len() > positions_m.len() {
         let extra = truth.len() - positions_m.len();
-        eprintln!("warning: {}: {extra} lines belong to no frame; is it the truth of this recording?", path.display());
+        let (path, lines) = (path.display(), counted(extra, "line"));
+        eprintln!("warning: {path}: {lines} of no frame; is it the truth of this recording?");
     }
     Ok(positions_m)
+}
+
+/// A truth that lies further from the recorded positions than any receiver errs is of another drive, or counted from another
+/// origin \[m\].
+const ELSEWHERE_M: f64 = 10.0;
+
+/// Why `truth_m`, read from `path`, is hardly that of `survey`.
+pub fn elsewhere(path: &std::path::Path, truth_m: &[PositionM], survey: &Survey) -> Option<String> {
+    let apart = truth_m.iter().zip(&survey.frames);
+    let mut apart_m: Vec<f64> = apart.map(|(&truth_m, frame)| distance_m(truth_m, frame.position_m)).collect();
+    apart_m.sort_unstable_by(f64::total_cmp);
+    let median_m = *apart_m.get(apart_m.len() / 2)?;
+    (median_m > ELSEWHERE_M).then(|| {
+        format!(
+            "--truth {}: half of its positions are more than {median_m:.1} m from the recorded ones: is it the truth of this \
+             recording, from the same origin?",
+            path.display()
+        )
+    })
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 
-use super::evaluate::open_map;
+use super::evaluate_map::open_map;
 use super::map_report;
 use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::sequence::{Sequence, SequenceFigures};
 use crate::metrics::ErrorFigures;
-use crate::types::{LocalizationState, PositionM};
+use crate::types::{LocalizationState, PositionM, counted};
 
 /// One row of the evaluation. The names are a contract with scripts: keys are added, never renamed; `null` where a
 /// figure has no meaning.
@@ -183,12 +183,12 @@ pub fn table(entries: &[Entry]) -> String {
 }
 
 fn heading(first: &Entry, seeds: usize) -> String {
-    let counts =
-        format!("{} learning, {} validation, {} test frames", first.n_learning, first.n_validation, first.n_test);
+    let n_test = counted(first.n_test, "test frame");
+    let counts = format!("{} learning, {} validation, {n_test}", first.n_learning, first.n_validation);
     let title = match (&first.split, seeds) {
         (Some(split), 1) => format!("{split} split: {counts}"),
         (Some(split), _) => format!("{split} split: {counts}, mean over {seeds} seeds"),
-        (None, _) => format!("against a map: {} frames", first.n_test),
+        (None, _) => format!("against a map: {}", counted(first.n_test, "frame")),
     };
     format!(
         "\n{title}\n{:8} {:26} {:>6} {:>5} {:>5} {:>12} {:>7} {:>7} {:>7} {:>7} | {:>7} {:>7} {:>7} {:>7} {:>6} {:>6} | {:>8} {:>8}\n",
@@ -225,11 +225,11 @@ fn line(rows: &[&Entry]) -> String {
         Some(value) => format!("{value:>width$.decimals$}"),
         None => format!("{:>width$}", "-"),
     };
-    let meters = |of: &dyn Fn(&Entry) -> Option<f64>| {
-        let value = mean(of);
+    let in_meters = |value: Option<f64>| {
         let decimals = if value.is_some_and(|v| v.abs() < 9.995) { 2 } else { 1 };
         number(value, 7, decimals)
     };
+    let meters = |of: &dyn Fn(&Entry) -> Option<f64>| in_meters(mean(of));
     let count = |of: fn(&Entry) -> Option<usize>| mean(&|entry| of(entry).map(|n| n as f64));
     let kept = match (count(|e| e.kept), mean(&|e| e.compression)) {
         (Some(kept), Some(compression)) => format!("{kept:.0} ({compression:.1})"),
@@ -251,7 +251,7 @@ fn line(rows: &[&Entry]) -> String {
         meters(&|e| e.rmse_all_test_m),
         meters(&|e| e.rmse_be_validation_m),
         meters(&|e| e.rmse_be_test_m),
-        meters(&|e| e.emax_test_m),
+        in_meters(emax_m(rows)),
         meters(&|e| e.rmse_m),
         meters(&|e| e.median_m),
         meters(&|e| e.p90_m),
@@ -263,16 +263,22 @@ fn line(rows: &[&Entry]) -> String {
     )
 }
 
+/// Largest test error of all entries \[m\]: the mean of maxima would be the maximum of nothing.
+pub fn emax_m(entries: &[&Entry]) -> Option<f64> {
+    entries.iter().map(|entry| entry.emax_test_m).reduce(|a, b| Some(a?.max(b?))).flatten()
+}
+
 /// What the columns mean, for under the tables.
 pub const LEGEND: &str = "\
 All errors in metres, from the positions as recorded, or from --truth, also where the positions that are learned from
 are corrected. images: what the tested model was learned from; the default recipe chooses nothing on the validation
 frames, so that, once measured on them (BE V), it learns from them too. m properties, rank after scaling, kept by the
 selection (m / kept). RMSE: all T with all features on the test frames; BE V and BE T with the features kept, on
-validation and test frames; e_max the largest test error. Right of the bar, the estimate the recipe stands for. skill:
-1 - RMSE / RMSE of always answering the median position; 1 is perfect, 0 knows nothing. Where features are chosen, BE V
-is of the frames they were chosen on: it flatters. Rows of features are of single frames; `filtered` and `smoothed` take
-all features and the frames one after the other, filtered only those for which it says a position.
+validation and test frames; e_max the largest test error of all seeds, where all else is their mean. Right of the bar,
+the estimate the recipe stands for. skill: 1 - RMSE / RMSE of always answering the median position; 1 is perfect, 0 knows
+nothing. Where features are chosen, BE V is of the frames they were chosen on: it flatters. Rows of features are of single
+frames; `filtered` and `smoothed` take all features and the frames one after the other, filtered only those for which it
+says a position.
 
 Without a recipe: nearest, the learning image with the most similar z-scored properties; aligned, by circular correlation
 of small panoramas; bow-nearest, by visual words; median, always the median position. bow is the paper's bag of words:
@@ -300,8 +306,11 @@ mod tests {
 
     #[test]
     fn seeds_are_averaged_into_one_row() {
-        let text = table(&[entry(0, 1.0), entry(1, 3.0)]);
+        let of = |seed, rmse_m, emax_m| Entry { emax_test_m: Some(emax_m), ..entry(seed, rmse_m) };
+        let text = table(&[of(0, 1.0, 4.0), of(1, 3.0, 7.5)]);
         assert!(text.contains("mean over 2 seeds") && text.contains("2.00") && text.lines().count() == 4, "{text}");
+        // The largest error of all is no mean.
+        assert!(text.contains("7.50") && !text.contains("5.75"), "{text}");
     }
 
     #[test]

@@ -4,6 +4,8 @@ use faer::Mat;
 
 use super::baselines::{Baseline, BaselineRows, Frames, Views};
 use super::entry::Entry;
+use super::shifts::PositionShift;
+use super::statistics::Section;
 use crate::features::Descriptor;
 use crate::map::{Grid, Recipe, Selection, Smoothing};
 use crate::metrics::ErrorFigures;
@@ -65,6 +67,8 @@ pub struct Protocol<'a> {
 #[derive(Debug, Clone, Default)]
 pub struct CaseResults {
     pub entries: Vec<Entry>,
+    /// One a recipe whose positions were smoothed.
+    pub shifts: Vec<PositionShift>,
     /// What the fits had to say.
     pub notes: Vec<String>,
 }
@@ -103,6 +107,14 @@ impl Protocol<'_> {
                         learned.sort_unstable();
                     }
                     let smoothed = smoother.smoothed(&learned, similarity.as_ref());
+                    results.shifts.extend(PositionShift::of_trial(
+                        (Section::of(&frames.base), case.seed),
+                        recipe.name.name(),
+                        &learned,
+                        [&frames.recorded_m, &smoothed.positions_m],
+                        &frames.indices,
+                        smoothed.reports[0],
+                    ));
                     let remaining_std_m = smoothed.remaining_std_m(survey);
                     (smoothed.positions_m, remaining_std_m)
                 }

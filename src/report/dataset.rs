@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::figure::slug;
 use super::insight::{FrameAnswer, Insight, InsightError};
 use super::photograph::Photograph;
-use crate::evaluate::{Case, Entry, Evaluation, Statistics, WordAssignment};
+use crate::evaluate::{Case, Entry, Evaluation, PositionShift, Statistics, WordAssignment};
 use crate::map::{FeatureMap, MapInfo};
 use crate::recording::Recording;
 use crate::train::{Outcomes, Split, Survey, SurveyedFrame, Trial};
@@ -29,6 +29,9 @@ pub struct Dataset {
     pub sequences: Vec<ShownSequence>,
     pub statistics: Statistics,
     pub assignments: Vec<WordAssignment>,
+    pub shifts: Vec<PositionShift>,
+    /// What makes the results doubtful.
+    pub warnings: Vec<String>,
     /// The map that was measured against.
     pub map: Option<MapFacts>,
     /// By row.
@@ -168,6 +171,8 @@ impl Dataset {
             sequences: Vec::new(),
             statistics: Statistics::default(),
             assignments: Vec::new(),
+            shifts: Vec::new(),
+            warnings: Vec::new(),
             map: None,
             photographs: BTreeMap::new(),
         }
@@ -215,6 +220,8 @@ impl Dataset {
         self.entries = evaluation.entries.clone();
         self.statistics = evaluation.statistics.clone();
         self.assignments = evaluation.assignments.clone();
+        self.shifts = evaluation.shifts.clone();
+        self.warnings = evaluation.warnings.clone();
         let row_of = |index: usize| self.frames.iter().position(|frame| frame.index == index);
         let of_drive = |entry: &&Entry| entry.estimator != "single";
         self.sequences = self.entries.iter().filter(of_drive).map(|entry| ShownSequence::of(entry, row_of)).collect();

@@ -10,7 +10,8 @@ use super::chart::plot::NOTE;
 use super::chart::scale::meters;
 use super::chart::svg::{Paint, Shapes, document, escaped};
 use super::dataset::Dataset;
-use super::figures::extent_of;
+use super::figure::capitalized;
+use super::figures::{cases, extent_of};
 use super::methods::{FrameError, headline, methods};
 use super::photograph::Photograph;
 use crate::jpeg::JpegError;
@@ -18,8 +19,14 @@ use crate::panorama::UnwrapTable;
 use crate::recording::{Recording, RecordingError};
 use crate::types::{CalibrationError, PositionM, distance_m};
 
-/// Frames that are shown.
-const WORST: usize = 6;
+/// Frames that are shown of a split, by the number of splits: few enough to be looked at.
+fn shown_of_a_split(splits: usize) -> usize {
+    match splits {
+        0 | 1 => 6,
+        2 => 4,
+        _ => 3,
+    }
+}
 
 /// A frame and why it may have gone wrong.
 #[derive(Debug, Clone)]
@@ -39,15 +46,30 @@ pub struct Neighbour {
     pub photograph: Photograph,
 }
 
-/// What is shown, before any image is read.
+/// What is shown of a split, before any image is read.
 #[derive(Debug, Clone)]
 pub struct Chosen {
     pub method: String,
-    /// The split whose test frames they are; `None` against a map.
+    /// The split whose test frames they are, and what it is; no split against a map.
     pub split: Option<String>,
+    pub case: String,
     pub frames: Vec<FrameError>,
-    /// Learning frames: recording and row, position.
-    learning: Vec<Vec<((usize, usize), PositionM)>>,
+    /// Learning frames of each of them.
+    learning: Vec<Vec<LearningFrame>>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct LearningFrame {
+    /// Number of the recording, and row in it.
+    place: (usize, usize),
+    position_m: PositionM,
+}
+
+/// A split's worst frames.
+#[derive(Debug, Clone)]
+pub struct Gallery {
+    pub chosen: Chosen,
+    pub worst: Vec<Worst>,
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -60,22 +82,41 @@ pub enum GalleryError {
     Frame { index: usize, source: JpegError },
 }
 
-/// The worst frames of the headline method, each once. `surveys` are what a map was learned from.
-pub fn choose(dataset: &Dataset, surveys: &[Recording]) -> Option<Chosen> {
-    let split = dataset.split_names().into_iter().next();
+/// The worst frames of every split. `surveys` are what a map was learned from.
+pub fn galleries(
+    dataset: &Dataset,
+    recording: &Recording,
+    surveys: &[Recording],
+) -> Result<Vec<Gallery>, GalleryError> {
+    let cases = cases(dataset);
+    let count = shown_of_a_split(cases.len());
+    let chosen = cases.into_iter().filter_map(|(split, case)| choose(dataset, surveys, split, case, count));
+    let galleries = read(chosen.collect(), dataset, recording, surveys)?;
+    Ok(galleries.into_iter().filter(|gallery| !gallery.worst.is_empty()).collect())
+}
+
+/// The worst `count` frames of the headline method on a split, each once.
+fn choose(
+    dataset: &Dataset,
+    surveys: &[Recording],
+    split: Option<String>,
+    case: String,
+    count: usize,
+) -> Option<Chosen> {
     let all = methods(dataset, split.as_deref());
     let method = headline(&all)?;
     let mut errors = method.errors();
     errors.sort_by(|a, b| b.error_m.total_cmp(&a.error_m).then(a.index.cmp(&b.index)));
     let mut seen = BTreeSet::new();
     errors.retain(|frame| seen.insert(frame.index));
-    errors.truncate(WORST);
-    let learning_of = |frame: &FrameError| -> Vec<((usize, usize), PositionM)> {
+    errors.truncate(count);
+    let learning_of = |frame: &FrameError| -> Vec<LearningFrame> {
         if dataset.map.is_some() {
             let of = surveys.iter().enumerate();
             return of
                 .flat_map(|(i, recording)| {
-                    recording.survey.iter().enumerate().map(move |(row, f)| ((i, row), f.position_m))
+                    let rows = recording.survey.iter().enumerate();
+                    rows.map(move |(row, f)| LearningFrame { place: (i, row), position_m: f.position_m })
                 })
                 .collect();
         }
@@ -85,41 +126,33 @@ pub fn choose(dataset: &Dataset, surveys: &[Recording]) -> Option<Chosen> {
         let refits = entry.is_some_and(|entry| entry.n_learned_from > entry.n_learning);
         let validation = if refits { &shown.split.validation[..] } else { &[] };
         let rows = shown.split.learning.iter().chain(validation);
-        rows.map(|&row| ((0, row), dataset.frames[row].position_m)).collect()
+        rows.map(|&row| LearningFrame { place: (0, row), position_m: dataset.frames[row].position_m }).collect()
     };
     let learning = errors.iter().map(learning_of).collect();
-    Some(Chosen { method: method.label.clone(), split, frames: errors, learning })
+    Some(Chosen { method: method.label.clone(), split, case, frames: errors, learning })
 }
 
-/// Reads the images of what was chosen, and of the frame at `shown_row`.
-pub fn read(
-    chosen: &Chosen,
+/// Reads the images of what was chosen; every recording once.
+fn read(
+    all: Vec<Chosen>,
     dataset: &Dataset,
     recording: &Recording,
     surveys: &[Recording],
-) -> Result<Vec<Worst>, GalleryError> {
+) -> Result<Vec<Gallery>, GalleryError> {
     let row_of = |index: usize| dataset.frames.iter().position(|frame| frame.index == index);
-    let nearest = |i: usize, to: PositionM| {
-        let of = chosen.learning[i].iter();
-        of.min_by(|a, b| distance_m(a.1, to).total_cmp(&distance_m(b.1, to))).map(|(place, _)| *place)
-    };
     let sources: Vec<&Recording> = if dataset.map.is_some() { surveys.iter().collect() } else { vec![recording] };
-    let mut wanted: Vec<BTreeSet<usize>> = vec![BTreeSet::new(); sources.len()];
-    let neighbours: Vec<[Option<(usize, usize)>; 2]> = chosen
-        .frames
-        .iter()
-        .enumerate()
-        .map(|(i, frame)| [nearest(i, frame.truth_m), nearest(i, frame.estimate_m)])
-        .collect();
-    for (source, row) in neighbours.iter().flatten().flatten() {
-        wanted[*source].insert(*row);
+    let (mut own, mut wanted) = (BTreeSet::new(), vec![BTreeSet::new(); sources.len()]);
+    for chosen in &all {
+        for (frame, learning) in chosen.frames.iter().zip(&chosen.learning) {
+            own.extend(row_of(frame.index));
+            for (source, row) in near_ends(frame, learning).into_iter().flatten() {
+                wanted[source].insert(row);
+            }
+        }
     }
-    let own: BTreeSet<usize> = chosen.frames.iter().filter_map(|frame| row_of(frame.index)).collect();
     let own = photographs(recording, &own)?;
-    let mut learned = Vec::new();
-    for (source, rows) in sources.iter().zip(&wanted) {
-        learned.push(photographs(source, rows)?);
-    }
+    let learned = sources.iter().zip(&wanted).map(|(source, rows)| photographs(source, rows));
+    let learned = learned.collect::<Result<Vec<_>, _>>()?;
     let neighbour = |place: Option<(usize, usize)>| {
         let (source, row) = place?;
         let frame = &sources[source].survey[row];
@@ -127,11 +160,23 @@ pub fn read(
         let photograph = learned[source].get(&row)?.clone();
         Some(Neighbour { recording: sources[source].name.clone(), index, position_m, photograph })
     };
-    let worst = chosen.frames.iter().zip(&neighbours).filter_map(|(frame, [at_truth, at_answer])| {
-        let photograph = own.get(&row_of(frame.index)?)?.clone();
-        Some(Worst { frame: *frame, photograph, at_truth: neighbour(*at_truth), at_answer: neighbour(*at_answer) })
-    });
-    Ok(worst.collect())
+    let of_chosen = |chosen: Chosen| {
+        let worst = chosen.frames.iter().zip(&chosen.learning).filter_map(|(frame, learning)| {
+            let photograph = own.get(&row_of(frame.index)?)?.clone();
+            let [at_truth, at_answer] = near_ends(frame, learning).map(&neighbour);
+            Some(Worst { frame: *frame, photograph, at_truth, at_answer })
+        });
+        Gallery { worst: worst.collect(), chosen }
+    };
+    Ok(all.into_iter().map(of_chosen).collect())
+}
+
+/// The places of the learning frames nearest to where a frame was taken, and to where it was thought to be.
+fn near_ends(frame: &FrameError, learning: &[LearningFrame]) -> [Option<(usize, usize)>; 2] {
+    [frame.truth_m, frame.estimate_m].map(|to| {
+        let apart_m = |one: &LearningFrame| distance_m(one.position_m, to);
+        learning.iter().min_by(|a, b| apart_m(a).total_cmp(&apart_m(b))).map(|one| one.place)
+    })
 }
 
 /// Photographs of the frames at `rows`.
@@ -160,24 +205,24 @@ pub fn photographs(recording: &Recording, rows: &BTreeSet<usize>) -> Result<BTre
     Ok(found)
 }
 
-/// The gallery as HTML.
-pub fn html(dataset: &Dataset, chosen: &Chosen, worst: &[Worst]) -> String {
+/// A split's worst frames as HTML.
+pub fn html(dataset: &Dataset, Gallery { chosen, worst }: &Gallery) -> String {
     let mut html = format!(
-        "<p>The largest errors of <b>{}</b>{}, each frame once. Panoramas begin to the east where the yaw is known, so that \
-         those of one place look alike.</p><div class=\"gallery\">",
+        "<h4>{}</h4><p class=\"before-gallery\">The largest errors of the <b>{}</b>, each frame once. Panoramas begin to the east where the yaw is \
+         known, so that those of one place look alike.</p><div class=\"gallery\">",
+        escaped(&capitalized(&chosen.case)),
         escaped(&chosen.method),
-        chosen.split.as_ref().map(|split| format!(" in the {} split", escaped(split))).unwrap_or_default()
     );
-    for one in worst {
+    for (i, one) in worst.iter().enumerate() {
         let seed = one.frame.seed.map(|seed| format!(", seed {seed}")).unwrap_or_default();
         html += &format!(
-            "<article class=\"worst\"><h4>Frame {}{seed}: {} m off</h4><div class=\"pair\">\
+            "<article class=\"worst\"><h5>Frame {}{seed}: {} m off</h5><div class=\"pair\">\
              <img src=\"{}\" alt=\"camera image of frame {}\" width=\"320\" height=\"320\">{}</div>{}",
             one.frame.index,
             meters(one.frame.error_m),
             one.photograph.donut,
             one.frame.index,
-            small_map(dataset, &one.frame),
+            small_map(dataset, &one.frame, &chosen.learning[i]),
             panorama("this frame", &one.photograph)
         );
         match &one.at_truth {
@@ -224,7 +269,7 @@ fn panorama(what: &str, photograph: &Photograph) -> String {
 }
 
 /// Where it was and where it was thought to be, with a bar for scale in place of axes.
-fn small_map(dataset: &Dataset, frame: &FrameError) -> String {
+fn small_map(dataset: &Dataset, frame: &FrameError, learning: &[LearningFrame]) -> String {
     const SIDE_PX: f64 = 240.0;
     const BELOW_PX: f64 = 24.0;
     let Extent { low_m, high_m } = extent_of(dataset);
@@ -233,8 +278,10 @@ fn small_map(dataset: &Dataset, frame: &FrameError) -> String {
     let at = |[e, n]: PositionM| [(e - low_m[0]) * scale, (high_m[1] - n) * scale];
     let mut shapes = Shapes::default();
     shapes.rect([0.0, 0.0], size, Paint::fill(PAPER).outlined(GRID, 1.0));
-    let learned = dataset.insights.first().map(|insight| &insight.learning_m[..]).unwrap_or_default();
-    learned.iter().for_each(|&position_m| shapes.circle(at(position_m), 1.2, Paint::fill(FAINT)));
+    // Where the images that the map was learned from are not there, their positions are.
+    let of_map = dataset.insights.first().filter(|_| dataset.map.is_some()).map(|insight| &insight.learning_m[..]);
+    let learned = learning.iter().map(|one| one.position_m).chain(of_map.unwrap_or_default().iter().copied());
+    learned.for_each(|position_m| shapes.circle(at(position_m), 1.2, Paint::fill(FAINT)));
     let (truth, estimate) = (at(frame.truth_m), at(frame.estimate_m));
     shapes.line(truth, estimate, Paint::stroke(VERMILION, 1.6));
     shapes.circle(truth, 5.0, Paint::fill(PAPER).outlined(INK, 2.0));
@@ -250,7 +297,7 @@ fn small_map(dataset: &Dataset, frame: &FrameError) -> String {
     document([size[0] + 1.0, size[1] + BELOW_PX], &shapes, &label)
 }
 
-pub fn json(chosen: &Chosen, worst: &[Worst]) -> Value {
+pub fn json(Gallery { chosen, worst }: &Gallery) -> Value {
     let near = |neighbour: &Option<Neighbour>| {
         neighbour.as_ref().map(|n| json!({"recording": n.recording, "index": n.index, "position_m": n.position_m}))
     };

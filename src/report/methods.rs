@@ -1,11 +1,15 @@
 //! The methods that are compared: their names, their colours, and their errors over all seeds.
 
-use super::chart::color::{BLACK, BLUE, GREEN, MUTED, ORANGE, PURPLE, SKY, VERMILION};
+use super::chart::color::{BLACK, BLUE, BROWN, GREEN, MUTED, OLIVE, ORANGE, PURPLE, SKY, VERMILION};
 use super::dataset::Dataset;
 use crate::evaluate::statistics::{self, Comparison, MethodStatistics, Statistics};
-use crate::evaluate::{Entry, FrameEntry};
+use crate::evaluate::{Entry, FrameEntry, emax_m};
 use crate::features::Descriptor;
 use crate::types::PositionM;
+
+/// What takes a whole drive has the same colour in every figure.
+pub const FILTERED: &str = GREEN;
+pub const SMOOTHED: &str = PURPLE;
 
 /// All plain results of one method on one split.
 #[derive(Debug, Clone)]
@@ -47,12 +51,12 @@ impl<'a> Method<'a> {
         let is_baseline = entry.recipe.is_none();
         let is_sequence = entry.estimator != "single";
         let (label, color, dashes, kind) = match (entry.recipe, features) {
-            (_, "filtered") => ("filtered".to_owned(), GREEN, None, Kind::Whole),
-            (_, "smoothed") => ("smoothed".to_owned(), PURPLE, None, Kind::Whole),
+            (_, "filtered") => ("filtered".to_owned(), FILTERED, Some("12 3"), Kind::Whole),
+            (_, "smoothed") => ("smoothed".to_owned(), SMOOTHED, Some("5 2"), Kind::Whole),
             (_, "median") => ("always the median".to_owned(), MUTED, Some("2 3"), Kind::Nothing),
             (Some(recipe), "fused") => {
-                let color = if recipe == "paper" { VERMILION } else { BLUE };
-                (format!("{}, all features", recipe_name(recipe)), color, None, Kind::Whole)
+                let (color, dashes) = recipe_look(recipe);
+                (format!("{}, all features", recipe_name(recipe)), color, dashes, Kind::Whole)
             }
             (Some(recipe), of_type) => {
                 let color = if recipe == "paper" { ORANGE } else { SKY };
@@ -124,6 +128,11 @@ impl<'a> Method<'a> {
         })
     }
 
+    /// Largest error of all seeds \[m\].
+    pub fn emax_m(&self) -> Option<f64> {
+        emax_m(&self.entries)
+    }
+
     /// Mean over the seeds.
     pub fn mean(&self, of: impl Fn(&Entry) -> Option<f64>) -> Option<f64> {
         let values: Option<Vec<f64>> = self.entries.iter().map(|entry| of(entry)).collect();
@@ -157,8 +166,7 @@ pub fn methods<'a>(dataset: &'a Dataset, split: Option<&str>) -> Vec<Method<'a>>
         let mut own: Vec<&mut Method> = methods.iter_mut().filter(of_recipe).collect();
         if let [only] = &mut own[..] {
             only.kind = Kind::Whole;
-            only.dashes = None;
-            only.color = if recipe == "paper" { VERMILION } else { BLUE };
+            (only.color, only.dashes) = recipe_look(recipe);
         }
     }
     methods.sort_by_key(|method| (method.kind, method.entries[0].recipe != Some("default")));
@@ -172,6 +180,11 @@ pub fn headline<'a, 'b>(methods: &'b [Method<'a>]) -> Option<&'b Method<'a>> {
         .iter()
         .find(|method| whole(method) && method.entries[0].recipe == Some("default"))
         .or_else(|| methods.iter().find(whole))
+}
+
+/// Colour and dashes of a recipe with all it has.
+pub fn recipe_look(recipe: &str) -> (&'static str, Option<&'static str>) {
+    if recipe == "paper" { (VERMILION, Some("16 3 3 3")) } else { (BLUE, None) }
 }
 
 /// A recipe in words.
@@ -213,15 +226,39 @@ fn baseline_name(name: &str) -> (String, &'static str, Option<&'static str>) {
         "bow-nearest" => ("bag of words, nearest image".into(), BLACK, None),
         "bow-surf" => ("bag of words, SURF".into(), BLACK, Some("2 2")),
         "bow-surf-nearest" => ("bag of words, SURF, nearest image".into(), BLACK, Some("8 3 2 3")),
-        "nearest" => ("nearest image by features".into(), GREEN, Some("6 3")),
-        "aligned" => ("nearest image, aligned".into(), PURPLE, Some("6 3")),
-        other => (other.into(), GREEN, Some("2 2")),
+        "nearest" => ("nearest image by features".into(), BROWN, Some("10 2 2 2")),
+        "aligned" => ("nearest image, aligned".into(), OLIVE, Some("4 2 1 2 1 2")),
+        other => (other.into(), MUTED, Some("1 2")),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// On paper without colours only the dashes are left.
+    #[test]
+    fn methods_that_stand_together_differ_in_colour_and_in_dashes() {
+        let of = |recipe, features: &str| {
+            let estimator = if matches!(features, "filtered" | "smoothed") { "filtered" } else { "single" };
+            Method::of(&Entry { recipe, features: features.into(), estimator, ..Entry::default() })
+        };
+        let baselines = || ["nearest", "aligned", "bow-nearest", "median"].map(|name| of(None, name));
+        let with_map = ["fused", "filtered", "smoothed"].map(|name| of(Some("default"), name));
+        let in_protocol = ["paper", "default"].map(|recipe| of(Some(recipe), "fused"));
+        for methods in [
+            with_map.into_iter().chain(baselines()).collect::<Vec<_>>(),
+            in_protocol.into_iter().chain(baselines()).collect(),
+        ] {
+            for (i, a) in methods.iter().enumerate() {
+                for b in &methods[..i] {
+                    assert!(a.color != b.color, "{} and {}", a.label, b.label);
+                    // What is whole is drawn thicker than baselines.
+                    assert!((a.dashes, a.kind) != (b.dashes, b.kind), "{} and {}", a.label, b.label);
+                }
+            }
+        }
+    }
 
     #[test]
     fn every_result_has_a_name_and_its_place() {

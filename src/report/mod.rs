@@ -31,9 +31,10 @@ pub use insight::InsightError;
 
 use chart::picture::{PictureError, rasterized};
 use figure::{Drawn, Figure};
-use gallery::{Chosen, Worst};
+use gallery::Gallery;
 use tables::Table;
 
+use crate::evaluate::InputFile;
 use crate::gnss::date_of_day;
 use crate::recording::{Recording, RecordingError, write_bytes_atomically};
 
@@ -50,6 +51,8 @@ pub struct Report {
     pub command: Vec<String>,
     /// Options and what they were.
     pub settings: Vec<(String, String)>,
+    /// The files that were read.
+    pub inputs: Vec<InputFile>,
     pub datasets: Vec<Dataset>,
 }
 
@@ -69,7 +72,8 @@ pub enum ReportError {
 struct Part {
     drawn: Vec<Drawn>,
     tables: Vec<Table>,
-    gallery: Option<(Chosen, Vec<Worst>)>,
+    /// One a split.
+    galleries: Vec<Gallery>,
 }
 
 /// What is being done, for a progress display.
@@ -96,14 +100,8 @@ impl Report {
         for (dataset, recording) in self.datasets.iter_mut().zip(recordings) {
             let shown = BTreeSet::from([figures::shown_row(dataset)]);
             dataset.photographs = gallery::photographs(recording, &shown)?;
-            let gallery = match gallery::choose(dataset, surveys) {
-                Some(chosen) => {
-                    let worst = gallery::read(&chosen, dataset, recording, surveys)?;
-                    Some((chosen, worst))
-                }
-                None => None,
-            };
-            parts.push(Part { drawn: figures::all(dataset), tables: tables::all(dataset), gallery });
+            let galleries = gallery::galleries(dataset, recording, surveys)?;
+            parts.push(Part { drawn: figures::all(dataset), tables: tables::all(dataset), galleries });
         }
         let figures_folder = folder.join("figures");
         let make = |folder: &Path| {
@@ -171,9 +169,7 @@ impl Report {
                 }
             }
             part.tables.iter().for_each(|table| _ = tables.insert(table.id.clone(), table.json()));
-            if let Some((chosen, worst)) = &part.gallery {
-                galleries.insert(dataset.id.clone(), gallery::json(chosen, worst));
-            }
+            galleries.insert(dataset.id.clone(), part.galleries.iter().map(gallery::json).collect());
         }
         let datasets = self.datasets.iter().map(|dataset| {
             let facts: Map<String, Value> =
@@ -185,6 +181,8 @@ impl Report {
                 "map": dataset.map.as_ref().map(|map| json!({"file": map.path, "sha256": map.sha256, "info": map.info})),
                 "results": dataset.entries,
                 "statistics": dataset.statistics,
+                "position_shifts": dataset.shifts,
+                "warnings": dataset.warnings,
             })
         });
         json!({
@@ -192,6 +190,7 @@ impl Report {
             "made": self.made,
             "command": self.command,
             "settings": self.settings.iter().cloned().collect::<std::collections::BTreeMap<_, _>>(),
+            "inputs": self.inputs,
             "datasets": datasets.collect::<Vec<_>>(),
             "tables": tables,
             "figures": figures,
@@ -224,6 +223,7 @@ mod tests {
             made: String::new(),
             command: command.iter().map(|argument| (*argument).to_owned()).collect(),
             settings: Vec::new(),
+            inputs: Vec::new(),
             datasets: Vec::new(),
         }
     }

@@ -13,7 +13,9 @@ use super::figure::{Drawn, Figure, capitalized};
 use super::figures::{cases, recall_at};
 use super::methods::{Kind, Method, headline, methods};
 use super::{Part, gallery};
+use crate::evaluate::PositionShift;
 use crate::map::Selection;
+use crate::types::counted;
 
 const STYLE: &str = include_str!("page.css");
 /// Nothing may be fetched, and nothing runs.
@@ -62,7 +64,10 @@ pub fn html(report: &Report, parts: &[Part]) -> String {
 const FIRST: usize = 4;
 
 fn put_dataset(page: &mut String, dataset: &Dataset, part: &Part) {
-    let _ = write!(page, "<section id=\"{}\"><h2>{}</h2>", dataset.id, escaped(&dataset.name));
+    let _ = write!(page, "<section id=\"{}\" class=\"dataset\"><h2>{}</h2>", dataset.id, escaped(&dataset.name));
+    for warning in &dataset.warnings {
+        let _ = write!(page, "<p class=\"warning\"><b>Doubtful:</b> {}</p>", escaped(warning));
+    }
     put_glance(page, dataset);
     for drawn in &part.drawn[..part.drawn.len().min(FIRST)] {
         put_drawn(page, drawn);
@@ -73,9 +78,9 @@ fn put_dataset(page: &mut String, dataset: &Dataset, part: &Part) {
         put_drawn(page, drawn);
     }
     let _ = write!(page, "<h3 id=\"{}-gallery\">The worst frames</h3>", dataset.id);
-    match &part.gallery {
-        Some((chosen, worst)) if !worst.is_empty() => *page += &gallery::html(dataset, chosen, worst),
-        _ => *page += "<p class=\"left-out\">No frame has an estimate.</p>",
+    part.galleries.iter().for_each(|of_split| *page += &gallery::html(dataset, of_split));
+    if part.galleries.is_empty() {
+        *page += "<p class=\"left-out\">No frame has an estimate.</p>";
     }
     *page += "</section>";
 }
@@ -117,7 +122,7 @@ fn in_words(method: &Method, all: &[Method], case: &str) -> String {
     let seeds = method.entries.len();
     let n_test: usize = method.entries.iter().map(|entry| entry.n_test).sum();
     let mut text = match seeds {
-        1 => format!("{}, {n_test} frames: ", capitalized(case)),
+        1 => format!("{}, {}: ", capitalized(case), counted(n_test, "frame")),
         _ => format!("{}, {n_test} test frames over {seeds} seeds: ", capitalized(case)),
     };
     let rmse = |method: &Method| method.mean(|e| e.rmse_m).map(meters).unwrap_or_else(|| "–".into());
@@ -158,6 +163,8 @@ fn put_figure(page: &mut String, figure: &Figure) {
             " full"
         } else if width > 400.0 {
             " halves"
+        } else if panels.len() == 4 && width < 300.0 {
+            " quarters"
         } else {
             ""
         };
@@ -212,11 +219,14 @@ fn put_provenance(page: &mut String, report: &Report) {
     for dataset in &report.datasets {
         let _ = write!(page, "<h3>{}</h3>", escaped(&dataset.name));
         put_facts(page, &facts_of(&dataset.provenance));
+        put_shifts(page, dataset);
         if let Some(map) = &dataset.map {
             let info = &map.info;
-            let recordings = info.recordings.iter().map(|r| format!("{} ({} frames)", r.name, r.frames));
-            let groups =
-                info.groups.iter().map(|group| format!("{} ({} features)", group.recipe.descriptor, group.features));
+            let recordings = info.recordings.iter().map(|r| format!("{} ({})", r.name, counted(r.frames, "frame")));
+            let groups = info
+                .groups
+                .iter()
+                .map(|group| format!("{} ({})", group.recipe.descriptor, counted(group.features, "feature")));
             let selection = match info.selection {
                 Selection::None => "none",
                 Selection::Backward => "backward elimination",
@@ -247,9 +257,35 @@ fn put_provenance(page: &mut String, report: &Report) {
             *page += "</details>";
         }
     }
+    put_inputs(page, report);
     *page += "<h3>Settings</h3>";
     put_facts(page, &report.settings.iter().map(|(key, value)| (key.as_str(), value.clone())).collect::<Vec<_>>());
     let _ = write!(page, "<h4>To repeat it</h4><pre>{}</pre></section>", escaped(&report.command_line()));
+}
+
+fn put_inputs(page: &mut String, report: &Report) {
+    *page += "<h3>Files that were read</h3><div class=\"scroll\" tabindex=\"0\"><table class=\"inputs\"><thead><tr><th></th><th>file\
+              </th><th>SHA-256</th></tr></thead><tbody>";
+    for input in &report.inputs {
+        let (file, sha256) = (escaped(&input.file), escaped(&input.sha256));
+        let _ = write!(page, "<tr><th>{}</th><td>{file}</td><td><code>{sha256}</code></td></tr>", input.role);
+    }
+    *page += "</tbody></table></div>";
+}
+
+/// How far positions were moved before anything was learned at them.
+fn put_shifts(page: &mut String, dataset: &Dataset) {
+    let lines = PositionShift::lines(&dataset.shifts);
+    if lines.is_empty() {
+        return;
+    }
+    *page += "<h4>Positions that were learned from</h4>";
+    for line in lines {
+        let _ = write!(page, "<p>{}.</p>", escaped(&capitalized(&line)));
+    }
+    *page += "<p class=\"note\">Smoothing corrects what the receiver said by how a vehicle moves and by places seen more than \
+              once; errors are measured against the positions as they were recorded, or against --truth. Of every trial: \
+              <code>position_shifts</code> in report.json.</p>";
 }
 
 pub fn facts_of(facts: &Provenance) -> Vec<(&'static str, String)> {

@@ -7,8 +7,9 @@ use super::chart::svg::escaped;
 use super::dataset::Dataset;
 use super::figures::{RECALL_AT_M, cases, recall_at};
 use super::methods::{Kind, Method, feature_name, methods};
-use crate::evaluate::Entry;
-use crate::evaluate::statistics::Estimate;
+use crate::evaluate::statistics::{Estimate, p_text};
+use crate::evaluate::{Entry, emax_m};
+use crate::types::counted;
 
 #[derive(Debug, Clone)]
 pub struct Table {
@@ -85,7 +86,8 @@ impl Table {
 
     pub fn html(&self) -> String {
         let mut html = format!(
-            "<div class=\"table\" id=\"{id}\"><h4>{}</h4><div class=\"scroll\"><table><thead>",
+            "<div class=\"table\" id=\"{id}\"><h4>{}</h4><p class=\"hint\">Wider than the screen: swipe it sideways →</p><div \
+             class=\"scroll\" tabindex=\"0\"><table><thead>",
             escaped(&self.title),
             id = self.id
         );
@@ -105,7 +107,8 @@ impl Table {
         for (i, row) in self.rows.iter().enumerate() {
             if let Some(group) = &row.begins_group {
                 let span = self.columns.len() + 1;
-                html += &format!("<tr class=\"split\"><th colspan=\"{span}\">{}</th></tr>", escaped(group));
+                html +=
+                    &format!("<tr class=\"split\"><th colspan=\"{span}\"><span>{}</span></th></tr>", escaped(group));
             }
             let class = if row.is_strong { " class=\"strong\"" } else { "" };
             html += &format!("<tr{class}><th>{}</th>", escaped(&row.label));
@@ -172,8 +175,10 @@ fn paper_shape(dataset: &Dataset) -> Table {
         let begins = (before.as_ref() != Some(&key)).then(|| {
             let split = first.split.clone().unwrap_or_default();
             format!(
-                "{recipe} recipe, {split} split: {} learning, {} validation, {} test images",
-                first.n_learning, first.n_validation, first.n_test
+                "{recipe} recipe, {split} split: {} learning, {} validation, {}",
+                first.n_learning,
+                first.n_validation,
+                counted(first.n_test, "test image")
             )
         });
         before = Some(key);
@@ -197,7 +202,7 @@ fn paper_shape(dataset: &Dataset) -> Table {
                 Cell::meters(mean(&group, |e| e.rmse_all_test_m)),
                 Cell::meters(mean(&group, |e| e.rmse_be_test_m)),
                 Cell::meters(mean(&group, |e| e.rmse_be_validation_m)),
-                Cell::meters(mean(&group, |e| e.emax_test_m)),
+                Cell::meters(emax_m(&group)),
                 Cell::decimals(mean(&group, |e| e.bic_all.map(|bic| bic / 1e3)), 1),
                 Cell::decimals(mean(&group, |e| e.bic_kept.map(|bic| bic / 1e3)), 1),
             ],
@@ -207,9 +212,9 @@ fn paper_shape(dataset: &Dataset) -> Table {
     Table {
         id: format!("{}-table-paper", dataset.id),
         title: "In the shape of the paper’s Tables 1 and 2".into(),
-        note: "Mean over the seeds. All: with all features; BE: with those that backward elimination kept; T: on the test \
+        note: "Mean over the seeds, but for e_max. All: with all features; BE: with those that backward elimination kept; T: on the test \
                images, V: on the validation images, which the choice was made on and which therefore flatter where \
-               features were chosen. Ratio: features in all over features kept. e_max: largest test error. BIC: −2 Σ L + 4 k \
+               features were chosen. Ratio: features in all over features kept. e_max: largest test error of all seeds. BIC: −2 Σ L + 4 k \
                log n, where every feature has a likelihood of its own."
             .into(),
         columns: vec![
@@ -322,7 +327,7 @@ fn accuracy(dataset: &Dataset) -> Table {
                 Cell::meters(method.mean(|e| e.median_m)),
                 Cell::meters(method.mean(|e| e.p90_m)),
                 Cell::meters(method.mean(|e| e.p95_m)),
-                Cell::meters(method.mean(|e| e.emax_test_m)),
+                Cell::meters(method.emax_m()),
                 Cell::percent(method.mean(|e| e.share_over_10m)),
                 Cell::decimals(method.mean(|e| e.skill), 2),
             ];
@@ -351,7 +356,7 @@ fn accuracy(dataset: &Dataset) -> Table {
         id: format!("{}-table-accuracy", dataset.id),
         title: "Accuracy of every method".into(),
         note: "Images: what the method learned from. Skill: 1 − RMSE / RMSE of always answering the median position: 1 is \
-               perfect, 0 knows nothing. Found within: share of all test frames, all seeds together; frames without an \
+               perfect, 0 knows nothing. Max: of all seeds. Found within: share of all test frames, all seeds together; frames without an \
                answer are not found. Errors are of the frames that have one."
             .into(),
         columns,
@@ -376,7 +381,7 @@ fn intervals(dataset: &Dataset) -> Table {
             let difference = comparison.map(|comparison| three(&comparison.mean_difference_m));
             cells.extend((0..3).map(|i| Cell::meters(difference.map(|values| values[i]))));
             cells.push(Cell::percent(comparison.map(|comparison| comparison.closer_share.value)));
-            cells.push(Cell::decimals(comparison.map(|comparison| comparison.p_holm), 4));
+            cells.push(Cell::of(comparison.map(|comparison| comparison.p_holm), p_text));
             rows.push(Row {
                 label: method.label.clone(),
                 begins_group: group.take(),

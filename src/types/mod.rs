@@ -10,6 +10,7 @@ mod geometry;
 mod gnss;
 mod image;
 mod pool;
+mod text;
 mod time;
 
 pub use calibration::{AzimuthSense, CalibrationError, DonutCalibration, LensKind};
@@ -21,4 +22,5 @@ pub use geometry::{PositionM, distance_m, wrap_angle_rad};
 pub use gnss::{Fix, FixQuality, GnssSample, Heading, North, SampleTime, TimeScale};
 pub use image::{LumaImage, Tiles};
 pub use pool::{BufferPool, PooledBytes};
+pub use text::counted;
 pub use time::{Clock, ClockReading, ManualClock, NS_PER_S, ScaledClock, SystemClock};

@@ -3,8 +3,8 @@
     look_at_page.py CHROMIUM PAGE.html WIDTH[,WIDTH...] [--screenshots FOLDER]
 
 One JSON object a width on stdout: console errors, requests beyond the page itself, pictures that do not load, elements
-that stick out of the page, links within it that lead nowhere, and the smallest letters. Only Python's own library: the
-browser is steered through --remote-debugging-pipe, whose messages end with a zero byte.
+that stick out of the page, tables that scroll without a sign of it, links that lead nowhere, and the smallest letters.
+Only Python's own library: the browser is steered through --remote-debugging-pipe, whose messages end with a zero byte.
 """
 
 import base64
@@ -47,10 +47,15 @@ INSPECT = """
     const size = parseFloat(getComputedStyle(e).fontSize);
     if (size < smallest) { smallest = size; smallestText = e.textContent.slice(0, 40); }
   }
+  // What scrolls sideways must look like it.
+  const silent = [...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth + 1)
+    .filter(e => getComputedStyle(e).backgroundAttachment !== 'local, local, scroll, scroll' ||
+      innerWidth < 660 && e.previousElementSibling.getBoundingClientRect().height === 0)
+    .map(e => e.textContent.slice(0, 40));
   const lost = [...document.querySelectorAll('a[href^="#"]')].map(e => e.getAttribute('href').slice(1))
     .filter(id => !document.getElementById(id));
   return JSON.stringify({ wide, sticking, pictures: addresses.length, broken, smallest_px: smallest, smallest_text: smallestText,
-    lost, figures: document.querySelectorAll('.figure').length, font: document.fonts.check('12px Inter') });
+    lost, silent, figures: document.querySelectorAll('.figure').length, font: document.fonts.check('12px Inter') });
 })()
 """
 

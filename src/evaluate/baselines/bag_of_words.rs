@@ -1,4 +1,9 @@
 //! Bag of visual words: Do et al. (2015), section 5.3, and the same words as plain image retrieval.
+//!
+//! How far words of SURF err within `drive-378` is a matter of how many images are learned from: on its `split-0.csv` the
+//! nearest image errs by 8.2 m (RMSE) with the validation images to learn from too (283 images in all), by 13.3 to 15.3 m
+//! with few of them (196 to 205); an independent implementation, which learns from half of the images only, has 17.8 m.
+//! 3 to 16 % of the frames, those over 10 m, make up nearly all of it: the medians lie between 1.5 and 2.5 m.
 
 use rayon::prelude::*;
 use serde::Serialize;

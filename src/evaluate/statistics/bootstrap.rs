@@ -139,6 +139,11 @@ impl Errors {
         Self { seeds: rows.iter().map(of_seed).collect() }
     }
 
+    /// The largest of all.
+    pub fn largest_m(&self) -> f64 {
+        self.seeds.iter().filter_map(|of| Some(of.said.last()?.1)).fold(0.0, f64::max)
+    }
+
     pub fn seeds(&self) -> usize {
         self.seeds.len()
     }

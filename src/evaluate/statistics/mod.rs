@@ -95,6 +95,8 @@ pub struct MethodStatistics {
     pub mean_m: Estimate,
     pub median_m: Estimate,
     pub p95_m: Estimate,
+    /// The largest error of all seeds.
+    pub emax_m: f64,
     /// 1 − RMSE / RMSE of always answering the median position.
     pub skill: Option<Estimate>,
     /// Share of all test frames with an error up to [`RECALL_M`].
@@ -205,6 +207,11 @@ impl Method {
     }
 }
 
+/// A `p` with three decimals; smaller ones only as such.
+pub fn p_text(p: f64) -> String {
+    if p < 0.001 { "< 0.001".into() } else { format!("{p:.3}") }
+}
+
 impl Estimate {
     /// `value` with the interval of what the draws brought.
     fn of(value: f64, mut drawn: Vec<f64>) -> Self {
@@ -243,6 +250,7 @@ fn of_method(
         mean_m: estimate(&|f| f.mean_m),
         median_m: estimate(&|f| f.median_m),
         p95_m: estimate(&|f| f.p95_m),
+        emax_m: errors.largest_m(),
         skill,
         recall: std::array::from_fn(|i| estimate(&|f| f.recall[i])),
         rmse_of_seeds_m: seeds().map(|f| f.rmse_m).collect(),
@@ -283,6 +291,12 @@ mod tests {
     }
 
     #[test]
+    fn no_p_is_written_as_zero() {
+        let found = [1.0, 0.049_6, 0.001, 0.000_99, 1e-4].map(p_text);
+        assert_eq!(found, ["1.000", "0.050", "0.001", "< 0.001", "< 0.001"]);
+    }
+
+    #[test]
     fn methods_are_compared_with_the_last_row_of_the_last_recipe() {
         let wavy = |i: usize| 1.5 + (i as f64 * 0.05).sin();
         let mut entries = rows(Some("paper"), "fft", 3, |i| wavy(i) + 0.5);
@@ -301,6 +315,7 @@ mod tests {
         let Estimate { value, low, high } = fft.mean_difference_m;
         assert!([value, low, high].iter().all(|difference| (difference - 0.5).abs() < 1e-9), "{fft:?}");
         assert_eq!(fft.closer_share.value, 0.0);
+        assert!((statistics.methods[0].emax_m - 3.0).abs() < 1e-3, "{:?}", statistics.methods[0]);
         let fused = &statistics.methods[1];
         assert!(fused.rmse_m.low < fused.rmse_m.value && fused.rmse_m.value < fused.rmse_m.high, "{fused:?}");
         assert!(fused.skill.expect("there is a median").value > 0.9 && fused.rmse_of_seeds_m.len() == 3);

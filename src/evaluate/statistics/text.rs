@@ -1,6 +1,6 @@
 //! The statistics as text, a line a method.
 
-use super::{Comparison, Estimate, MethodStatistics, Section, Statistics};
+use super::{Comparison, Estimate, MethodStatistics, Section, Statistics, p_text};
 
 pub fn text(statistics: &Statistics) -> String {
     let mut text = String::new();
@@ -37,7 +37,7 @@ fn heading(statistics: &Statistics, first: &MethodStatistics, reference: Option<
     let than =
         reference.map_or(String::new(), |reference| format!("; mean error against {reference} on the same frames"));
     format!(
-        "\n{what}: intervals of {level:.0} %{than}\n{:8} {:20} {:>22} {:>22} | {:>23} | {:>24} {:>7} {:>6}\n",
+        "\n{what}: intervals of {level:.0} %{than}\n{:8} {:20} {:>22} {:>22} | {:>23} | {:>24} {:>7} {:>7}\n",
         "recipe", "features", "RMSE", "median", "% within 1, 2, 5, 10 m", "larger by", "closer", "p"
     )
 }
@@ -47,10 +47,10 @@ fn line(of: &MethodStatistics, comparison: Option<&Comparison>) -> String {
     let compared = comparison.map_or("-".into(), |comparison| {
         let mark = if comparison.is_real { "*" } else { " " };
         format!(
-            "{:>24} {:>6.0}% {:>6.4}{mark}",
+            "{:>24} {:>6.0}% {:>7}{mark}",
             meters(&comparison.mean_difference_m),
             100.0 * comparison.closer_share.value,
-            comparison.p_holm
+            p_text(comparison.p_holm)
         )
     });
     let text = format!(

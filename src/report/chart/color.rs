@@ -18,6 +18,9 @@ pub const ORANGE: &str = "#d98e04";
 pub const PURPLE: &str = "#b2588f";
 pub const SKY: &str = "#56b4e9";
 pub const BLACK: &str = "#1b1f24";
+// Beyond the palette: for what stands beside all of it.
+pub const BROWN: &str = "#7a4419";
+pub const OLIVE: &str = "#8f9a1f";
 
 pub type Rgb = [u8; 3];
 

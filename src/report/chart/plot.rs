@@ -1,6 +1,6 @@
 //! A plot: title, legend, axes with units, and what is drawn between them.
 
-use super::color::{GRID, INK, MUTED};
+use super::color::{GRID, INK, MUTED, PAPER};
 use super::scale::Scale;
 use super::svg::{Anchor, Paint, Shapes, Type};
 use super::text::{fitted, width_px};
@@ -234,6 +234,19 @@ impl Plot {
         self.above.haloed_text([x + dx, y + dy], text, style);
     }
 
+    /// A text that whatever lies below it stops at.
+    pub fn label(&mut self, [x, y]: [f64; 2], text: &str, style: Type) {
+        let wide = width_px(text, style.size_px, style.bold);
+        let left = match style.anchor {
+            Anchor::Start => x,
+            Anchor::Middle => x - 0.5 * wide,
+            Anchor::End => x - wide,
+        };
+        let (above, below) = (0.85 * style.size_px, 0.3 * style.size_px);
+        self.above.rect([left - 2.0, y - above], [wide + 4.0, above + below], Paint::fill(PAPER));
+        self.above.text([x, y], text, style);
+    }
+
     pub fn finish(self) -> Panel {
         let mut shapes = self.below;
         shapes.clipped(self.area_at, self.area_size, &self.inside);
@@ -289,6 +302,21 @@ mod tests {
         let panel = plot.finish();
         let text = document(panel.size_px, &panel.shapes, &panel.title);
         assert!(text.contains("overflow=\"hidden\"") && text.contains("error [m]"), "{text}");
+    }
+
+    /// The white below a label covers all of it, on whichever side it is anchored.
+    #[test]
+    fn lines_stop_at_labels() {
+        for (anchor, left) in [(Anchor::Start, 100.0), (Anchor::End, 100.0 - width_px("a row", 11.0, false))] {
+            let axis = || Axis::new("", Scale::linear(0.0, 1.0));
+            let mut plot = Plot::new(Spec::new("", axis(), axis()));
+            plot.label([100.0, 50.0], "a row", NOTE.anchored(anchor));
+            let panel = plot.finish();
+            let text = document(panel.size_px, &panel.shapes, "");
+            let (rect, label) =
+                (text.find(&format!("<rect x=\"{}\"", super::super::svg::px(left - 2.0))), text.find("a row"));
+            assert!(rect.is_some() && rect < label, "{text}");
+        }
     }
 
     #[test]

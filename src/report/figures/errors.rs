@@ -96,7 +96,7 @@ fn comparison_panel(dataset: &Dataset, title: &str, methods: &[&Method], width_p
     let high = all.iter().copied().fold(0.0, f64::max) * 1.6;
     let x = Axis::new("error [m], logarithmic", Scale::log(low, high));
     let y = Axis::new("", Scale::linear(0.0, methods.len() as f64)).with_ticks([]);
-    let mut spec = Spec::new(title, x, y);
+    let mut spec = Spec::new(format!("{title}: RMSE (median)"), x, y);
     spec.width_px = width_px;
     spec.area_height_px = ROW_PX * methods.len() as f64 + 6.0;
     spec.legend = vec![
@@ -114,11 +114,8 @@ fn comparison_panel(dataset: &Dataset, title: &str, methods: &[&Method], width_p
         let [left, middle] = plot.at([plot.x.low, row]);
         let (Some(rmse_m), Some(median_m)) = (method.mean(|e| e.rmse_m), method.mean(|e| e.median_m)) else { continue };
         // The name stands above its line, so that it may be as long as it is.
-        plot.above.haloed_text(
-            [left + 4.0, middle - 5.0],
-            &fitted(&method.label, NOTE.size_px, false, width_px - 110.0),
-            NOTE,
-        );
+        let label = fitted(&method.label, NOTE.size_px, false, width_px - 110.0);
+        plot.label([left + 4.0, middle - 5.0], &label, NOTE);
         let at = |value: f64| [value, row - 0.16];
         plot.segment(at(median_m), at(rmse_m), Paint::stroke(method.color, 2.0).opacity(0.5));
         let [x, y] = plot.at(at(median_m));
@@ -141,7 +138,7 @@ fn comparison_panel(dataset: &Dataset, title: &str, methods: &[&Method], width_p
         plot.inside.diamond([x, y], 5.5, Paint::fill(method.color));
         let text = format!("{}  ({})", meters(rmse_m), meters(median_m));
         let right = plot.area_at[0] + plot.area_size[0];
-        plot.above.haloed_text([right, middle - 5.0], &text, NOTE.anchored(Anchor::End));
+        plot.label([right, middle - 5.0], &text, NOTE.anchored(Anchor::End));
     }
     plot.finish()
 }
@@ -288,14 +285,11 @@ fn recall_panel(title: &str, methods: &[&Method], at_m: [f64; 4], width_px: f64)
                 Paint::fill(method.color).opacity(shade(3 - k)),
             );
         }
-        plot.above.haloed_text(
-            [left + 2.0, middle - 3.0],
-            &fitted(&method.label, NOTE.size_px, false, width_px - 130.0),
-            NOTE,
-        );
+        let label = fitted(&method.label, NOTE.size_px, false, width_px - 130.0);
+        plot.label([left + 2.0, middle - 3.0], &label, NOTE);
         let shares = at_m.map(|at_m| format!("{:.0}", 100.0 * recall_at(method, at_m))).join(" · ");
         let right = plot.area_at[0] + plot.area_size[0];
-        plot.above.haloed_text([right, middle - 3.0], &format!("{shares} %"), LABEL.anchored(Anchor::End));
+        plot.label([right, middle - 3.0], &format!("{shares} %"), LABEL.anchored(Anchor::End));
     }
     plot.finish()
 }

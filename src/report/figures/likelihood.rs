@@ -44,8 +44,8 @@ pub fn likelihood(dataset: &Dataset) -> Drawn {
         })
     });
     let of = match &insight.split {
-        Some((split, Some(seed))) => format!("{}, {split} split, seed {seed}", recipe_name(insight.recipe)),
-        Some((split, None)) => format!("{}, {split}", recipe_name(insight.recipe)),
+        Some((split, Some(seed))) => format!("the {}, {split} split, seed {seed},", recipe_name(insight.recipe)),
+        Some((split, None)) => format!("the {}, {split},", recipe_name(insight.recipe)),
         None => "the map".into(),
     };
     let caption = format!(

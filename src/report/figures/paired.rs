@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use super::errors::cases;
-use crate::evaluate::statistics::Comparison;
+use crate::evaluate::statistics::{Comparison, p_text};
 use crate::report::chart::color::{INK, MUTED};
 use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, NOTE, Panel, Plot, Spec};
 use crate::report::chart::scale::{Scale, meters, number};
@@ -96,15 +96,13 @@ fn panel(title: &str, all: &[Compared], width_px: f64) -> Panel {
         plot.dot([squeezed(estimate.value), row], 4.0, dot);
         let middle = plot.at([0.0, row + 0.3])[1];
         let left = plot.area_at[0] + 2.0;
-        plot.above.haloed_text([left, middle], &fitted(&one.label, NOTE.size_px, false, width_px - 150.0), NOTE);
+        plot.label([left, middle], &fitted(&one.label, NOTE.size_px, false, width_px - 150.0), NOTE);
         let sign = if estimate.value > 0.0 { "+" } else { "" };
-        let p = match one.comparison.p_holm {
-            p if p < 0.001 => "p < 0.001".to_owned(),
-            p => format!("p = {}", number(p, 3)),
-        };
+        let p = p_text(one.comparison.p_holm);
+        let p = if p.starts_with('<') { format!("p {p}") } else { format!("p = {p}") };
         let right = plot.area_at[0] + plot.area_size[0];
         let text = format!("{sign}{} m, {p}", meters(estimate.value));
-        plot.above.haloed_text([right, middle], &text, LABEL.anchored(Anchor::End));
+        plot.label([right, middle], &text, LABEL.anchored(Anchor::End));
     }
     plot.finish()
 }

@@ -4,15 +4,15 @@
 use serde_json::json;
 
 use super::errors::cases;
-use crate::report::chart::color::{BLUE, ERROR_CLASSES, FAINT, GREEN, INK, PURPLE, VERMILION};
+use crate::report::chart::color::{BLUE, ERROR_CLASSES, FAINT, INK, VERMILION};
 use crate::report::chart::map_plot::{Extent, ellipse_m, map_plot};
 use crate::report::chart::plot::{Key, LABEL, LegendItem, Panel, Plot};
 use crate::report::chart::scale::{meters, number};
-use crate::report::chart::svg::Paint;
+use crate::report::chart::svg::{Anchor, Paint};
 use crate::report::dataset::Dataset;
 use crate::report::figure::{Drawn, Figure};
 use crate::report::insight::{FrameAnswer, Insight};
-use crate::report::methods::{FrameError, Kind, Method, methods, recipe_name};
+use crate::report::methods::{FILTERED, FrameError, Kind, Method, SMOOTHED, methods, recipe_name};
 use crate::types::PositionM;
 
 /// The ellipses hold so much of the probability.
@@ -48,8 +48,8 @@ fn layers(dataset: &Dataset) -> Vec<Layer<'_>> {
         .collect();
     layers.extend(dataset.sequences.iter().filter(|s| !s.answers.is_empty()).map(|sequence| {
         let (title, color) = match sequence.estimator {
-            "filtered" => ("Filtered: as on the vehicle", GREEN),
-            "smoothed" => ("Smoothed: with later frames too", PURPLE),
+            "filtered" => ("Filtered: as on the vehicle", FILTERED),
+            "smoothed" => ("Smoothed: with later frames too", SMOOTHED),
             other => (other, BLUE),
         };
         Layer { title: title.into(), color, answers: &sequence.answers }
@@ -140,10 +140,10 @@ fn estimates_panel(dataset: &Dataset, extent: Extent, layer: &Layer, width_px: f
     plot.finish()
 }
 
-/// A note in the upper left corner of a map.
+/// A note above the right end of a map, where nothing lies below it.
 fn put_note(plot: &mut Plot, text: &str) {
-    let at = [plot.area_at[0] + 6.0, plot.area_at[1] + 14.0];
-    plot.above.haloed_text(at, text, LABEL);
+    let at = [plot.area_at[0] + plot.area_size[0], plot.area_at[1] - 9.0];
+    plot.above.text(at, text, LABEL.anchored(Anchor::End));
 }
 
 /// Where on the map the errors are.

@@ -2,6 +2,7 @@
 
 use serde_json::json;
 
+use crate::metrics::coverage_verdict;
 use crate::report::chart::color::{FAINT, INK};
 use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, NOTE, Panel, Plot, Spec};
 use crate::report::chart::scale::{Scale, number};
@@ -45,19 +46,25 @@ pub fn reliability(dataset: &Dataset) -> Drawn {
             "coverage_50": coverage(&levels, 0.5),
             "coverage_90": coverage(&levels, 0.9),
             "coverage_95": coverage(&levels, 0.95),
+            "verdict": coverage_verdict(coverage(&levels, 0.95), levels.len()),
         })
     });
     let data: Vec<_> = data.collect();
-    let caption = "Left: a curve on the dashed line keeps its promise; below it the regions are too small (over-confident), \
-                   above it too large. Right: the normalised error squared should follow χ² with two degrees of freedom, \
-                   of median 1.4 and mean 2; a curve further right is over-confident, further left too cautious. Gray: \
-                   where 95 % of such curves lie by chance.";
+    let verdicts: Vec<String> = series.iter().map(verdict).collect();
+    let caption = format!(
+        "Regions that should hold the truth in 95 % of the frames hold it in {}. Left: a curve on the dashed line keeps its promise; below it the regions \
+         are too small (over-confident), above it too large. Right: the normalised error squared should follow χ² with two \
+         degrees of freedom, of median 1.4 and mean 2; a curve further right is over-confident, further left too cautious. \
+         Gray: where 95 % of such curves lie by chance.",
+        verdicts.join(", ")
+    );
     let figure = Figure::new(format!("{}-reliability", dataset.id), TITLE, caption, json!(data));
     figure.with_panels(vec![coverage_panel(&series), nees_panel(&series), table_panel(&series)]).into()
 }
 
 fn series(dataset: &Dataset) -> Vec<Series<'_>> {
-    use crate::report::chart::color::{BLUE, GREEN, PURPLE, VERMILION};
+    use crate::report::chart::color::{BLUE, VERMILION};
+    use crate::report::methods::{FILTERED, SMOOTHED};
     let of_insights = dataset.insights.iter().map(|insight| {
         let color = if insight.recipe == "paper" { VERMILION } else { BLUE };
         let (label, is_first) = match &insight.split {
@@ -68,14 +75,30 @@ fn series(dataset: &Dataset) -> Vec<Series<'_>> {
         Series { label, paint: if is_first { paint } else { paint.dashed("5 3") }, answers: &insight.frames }
     });
     let of_sequences = dataset.sequences.iter().map(|sequence| {
-        let color = if sequence.estimator == "filtered" { GREEN } else { PURPLE };
-        Series { label: sequence.estimator.into(), paint: Paint::stroke(color, 2.0), answers: &sequence.answers }
+        let paint = match sequence.estimator {
+            "filtered" => Paint::stroke(FILTERED, 2.0).dashed("12 3"),
+            _ => Paint::stroke(SMOOTHED, 2.0).dashed("5 2"),
+        };
+        Series { label: sequence.estimator.into(), paint, answers: &sequence.answers }
     });
     of_insights.chain(of_sequences).filter(|series| series.answers.len() >= MIN_FRAMES).collect()
 }
 
-fn coverage(sorted_levels: &[f64], nominal: f64) -> f64 {
-    sorted_levels.iter().filter(|&&level| level < nominal).count() as f64 / sorted_levels.len() as f64
+/// As in `93 % of 378 (filtered: as stated)`.
+fn verdict(series: &Series) -> String {
+    let levels: Vec<f64> = series.answers.iter().map(|a| a.credible_level).collect();
+    let covered = coverage(&levels, 0.95);
+    format!(
+        "{} % of {} ({}: {})",
+        number(100.0 * covered, 0),
+        levels.len(),
+        series.label,
+        coverage_verdict(covered, levels.len())
+    )
+}
+
+fn coverage(levels: &[f64], nominal: f64) -> f64 {
+    levels.iter().filter(|&&level| level < nominal).count() as f64 / levels.len() as f64
 }
 
 /// Between these lies the mean NEES of n independent frames with a probability of 95 %: χ² with 2n degrees of freedom over

@@ -3,13 +3,14 @@
 use serde_json::json;
 
 use super::time_s;
-use crate::report::chart::color::{BLUE, FAINT, GREEN, MUTED, ORANGE, PURPLE, VERMILION};
+use crate::report::chart::color::{FAINT, MUTED, ORANGE, SKY, VERMILION};
 use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, PANEL_WIDTH_PX, Panel, Plot, Spec};
 use crate::report::chart::scale::Scale;
 use crate::report::chart::svg::{Paint, Shapes};
 use crate::report::dataset::{Dataset, ShownSequence};
 use crate::report::figure::{Drawn, Figure};
 use crate::report::insight::FrameAnswer;
+use crate::report::methods::{FILTERED, SMOOTHED};
 use crate::types::LocalizationState;
 
 const WIDE_PX: f64 = 1136.0;
@@ -77,7 +78,7 @@ fn state_color(state: LocalizationState) -> &'static str {
     match state {
         LocalizationState::Unknown => FAINT,
         LocalizationState::Candidate => ORANGE,
-        LocalizationState::Localized => GREEN,
+        LocalizationState::Localized => SKY,
         LocalizationState::Lost => VERMILION,
     }
 }
@@ -103,9 +104,9 @@ fn panel(dataset: &Dataset, filtered: &ShownSequence, width_px: f64) -> Panel {
     let has_state = |state: &&LocalizationState| filtered.states.contains(&Some(state.name()));
     spec.legend = vec![
         LegendItem::new("single frames", Key::Dot(Paint::fill(MUTED).opacity(0.6))),
-        LegendItem::new("filtered", Key::Line(Paint::stroke(BLUE, 2.0))),
-        LegendItem::new("95 % region of the filter", Key::Box(Paint::fill(BLUE).opacity(0.2))),
-        LegendItem::new("smoothed", Key::Line(Paint::stroke(PURPLE, 1.4))),
+        LegendItem::new("filtered", Key::Line(Paint::stroke(FILTERED, 2.0))),
+        LegendItem::new("95 % region of the filter", Key::Box(Paint::fill(FILTERED).opacity(0.2))),
+        LegendItem::new("smoothed", Key::Line(Paint::stroke(SMOOTHED, 1.4).dashed("5 2"))),
     ];
     spec.legend.extend(
         states
@@ -128,13 +129,15 @@ fn panel(dataset: &Dataset, filtered: &ShownSequence, width_px: f64) -> Panel {
     for run in runs(&filtered.answers) {
         let upper: Vec<_> = run.iter().map(|a| [times[a.row], radius_95_m(a)]).collect();
         let lower: Vec<_> = run.iter().map(|a| [times[a.row], low]).collect();
-        plot.band(&lower, &upper, Paint::fill(BLUE).opacity(0.16));
+        plot.band(&lower, &upper, Paint::fill(FILTERED).opacity(0.16));
     }
     for answer in single {
         plot.dot([times[answer.row], answer.error_m().max(low)], 1.6, Paint::fill(MUTED).opacity(0.6));
     }
     let smoothed = dataset.sequences.iter().find(|sequence| sequence.estimator == "smoothed");
-    for (sequence, paint) in [(smoothed, Paint::stroke(PURPLE, 1.4)), (Some(filtered), Paint::stroke(BLUE, 2.0))] {
+    for (sequence, paint) in
+        [(smoothed, Paint::stroke(SMOOTHED, 1.4).dashed("5 2")), (Some(filtered), Paint::stroke(FILTERED, 2.0))]
+    {
         for run in sequence.map(|sequence| runs(&sequence.answers)).unwrap_or_default() {
             let points: Vec<_> = run.iter().map(|a| [times[a.row], a.error_m().max(low)]).collect();
             plot.curve(&points, paint);
