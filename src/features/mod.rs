@@ -46,14 +46,7 @@ pub enum Descriptor {
 }
 
 impl Descriptor {
-    pub const ALL: [Self; 6] = [
-        Self::Fft,
-        Self::Hist,
-        Self::Sp,
-        Self::Gradient,
-        Self::Patches,
-        Self::PatchWords,
-    ];
+    pub const ALL: [Self; 6] = [Self::Fft, Self::Hist, Self::Sp, Self::Gradient, Self::Patches, Self::PatchWords];
     /// The three the paper evaluates.
     pub const PAPER: [Self; 3] = [Self::Fft, Self::Hist, Self::Sp];
 
