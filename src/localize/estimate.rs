@@ -36,6 +36,21 @@ pub fn refined_m(cells: &CandidateCells, log_likelihood: &[f32], best: usize) ->
     [center_m[0] + east * cells.grid.step_m, center_m[1] + north * cells.grid.step_m]
 }
 
+/// The [refined](refined_m) best cell among those at most [`SUMMIT_STEPS`] from `position_m`; `None` where none of them is
+/// a candidate.
+pub fn summit_near(cells: &CandidateCells, log_likelihood: &[f32], position_m: PositionM) -> Option<PositionM> {
+    let [column, row] = [0, 1].map(|axis| ((position_m[axis] - cells.grid.origin_m[axis]) / cells.grid.step_m).round());
+    let around = |middle: f64| {
+        (-SUMMIT_STEPS..=SUMMIT_STEPS).filter_map(move |step| u32::try_from(middle as i64 + i64::from(step)).ok())
+    };
+    let near = around(row).flat_map(|j| around(column).filter_map(move |i| cells.index_of([i, j])));
+    let best = near.max_by(|&a, &b| log_likelihood[a].total_cmp(&log_likelihood[b]))?;
+    Some(refined_m(cells, log_likelihood, best))
+}
+
+/// A hill's mean and its summit are no further apart.
+const SUMMIT_STEPS: i32 = 2;
+
 #[cfg(test)]
 mod tests {
     use super::*;

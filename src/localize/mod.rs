@@ -16,6 +16,7 @@
 mod belief;
 mod estimate;
 mod heading;
+mod kalman;
 mod large;
 mod likelihood;
 mod localizer;
@@ -26,7 +27,7 @@ mod state;
 mod tracker;
 
 pub use belief::Mode;
-pub use estimate::{most_likely_cell, refined_m};
+pub use estimate::{most_likely_cell, refined_m, summit_near};
 pub use likelihood::{FieldOnCells, MapFields, log_likelihood_nowhere};
 pub use localizer::{FIELDS_IN_MEMORY_BYTES, FrameError, Localizer, LocalizerError, Stage, Timings};
 pub use motion::{ConstantVelocity, Motion, MotionModel, MotionSettings};

@@ -7,9 +7,8 @@
 //! Rauch-Tung-Striebel smoother (1965) over what the frames say by themselves within their hills, at a velocity that
 //! stays the same but for a white acceleration: unlike the cells, it knows that velocity in each direction.
 
-use nalgebra::{Matrix2, Matrix2x4, Matrix4, Vector2, Vector4};
-
 use super::belief::Mode;
+use super::kalman::{State, Transition, symmetric};
 use super::motion::MotionSettings;
 use super::tracker::{Observation, Tracker};
 use crate::map::FeatureMap;
@@ -26,8 +25,6 @@ pub struct Smoothed {
 const LEAST_PROBABILITY: f32 = 1e-9;
 /// Neighbouring frames err alike: of all frames of a drive, so many together are worth one.
 const FRAMES_ALIKE: f64 = 4.0;
-/// Deviation from a smooth motion over a second; the rest of a vehicle's diffusion is the filter's lag \[m\].
-const JITTER_M: f64 = 0.1;
 
 /// Smooths a drive: frames in the order of their stamps.
 pub fn smooth(map: &FeatureMap, settings: MotionSettings, frames: &[Observation]) -> Vec<Smoothed> {
@@ -52,7 +49,10 @@ pub fn smooth(map: &FeatureMap, settings: MotionSettings, frames: &[Observation]
             backward.advance(reversed.stamp_ns, None);
             let hill = backward.belief().product(after);
             backward.take(&reversed);
-            backward.sighting(hill.mean_m)
+            let seen = backward.sighting(hill.mean_m, frame.log_likelihood);
+            let PositionCovariance { ee_m2, en_m2, nn_m2 } = seen.covariance;
+            let [ee_m2, en_m2, nn_m2] = [ee_m2, en_m2, nn_m2].map(|variance_m2| FRAMES_ALIKE * variance_m2);
+            Mode { covariance: PositionCovariance { ee_m2, en_m2, nn_m2 }, ..seen }
         })
         .collect();
     sightings.reverse();
@@ -61,58 +61,31 @@ pub fn smooth(map: &FeatureMap, settings: MotionSettings, frames: &[Observation]
     let smoothed = rauch_tung_striebel(&stamps_ns, &sightings, &settings);
     smoothed
         .into_iter()
-        .map(|State { mean, covariance }| Smoothed {
-            position_m: [mean[0], mean[1]],
-            covariance: forward.with_map_error(PositionCovariance {
-                ee_m2: covariance[(0, 0)],
-                en_m2: covariance[(0, 1)],
-                nn_m2: covariance[(1, 1)],
-            }),
+        .map(|state| Smoothed {
+            position_m: state.position_m(),
+            covariance: forward.with_map_error(state.position_covariance()),
         })
         .collect()
 }
 
-/// East, north \[m\] and their velocities \[m/s\].
-#[derive(Debug, Clone, Copy)]
-struct State {
-    mean: Vector4<f64>,
-    covariance: Matrix4<f64>,
-}
-
 fn rauch_tung_striebel(stamps_ns: &[u64], sightings: &[Mode], settings: &MotionSettings) -> Vec<State> {
     let Some(first) = sightings.first() else { return Vec::new() };
-    let observe = Matrix2x4::identity();
-    let mut velocity_m2 = Matrix4::zeros();
-    velocity_m2.fixed_view_mut::<2, 2>(2, 2).fill_diagonal((0.5 * settings.speed_limit_mps).powi(2));
-    let start = State {
-        mean: Vector4::new(first.mean_m[0], first.mean_m[1], 0.0, 0.0),
-        covariance: observe.transpose() * noise_of(first) * observe + velocity_m2,
-    };
+    let start = State::first(first, settings);
     // Forward: the state after each frame, and before it with the transition that led there.
-    let (mut states, mut predicted) = (vec![start], vec![(start, Matrix4::identity())]);
+    let (mut states, mut predicted) = (vec![start], vec![(start, Transition::after(0.0, settings))]);
     for (i, seen) in sightings.iter().enumerate().skip(1) {
         let dt_s = stamps_ns[i].saturating_sub(stamps_ns[i - 1]) as f64 / NS_PER_S as f64;
-        let (transition, jitter) = constant_velocity(dt_s, settings);
-        let last = states[i - 1];
-        let before = State {
-            mean: transition * last.mean,
-            covariance: transition * last.covariance * transition.transpose() + jitter,
-        };
-        let innovation: Matrix2<f64> = observe * before.covariance * observe.transpose() + noise_of(seen);
-        let Some(inverse) = innovation.try_inverse() else { return states };
-        let gain = before.covariance * observe.transpose() * inverse;
-        let surprise = Vector2::from(seen.mean_m) - observe * before.mean;
-        states.push(State {
-            mean: before.mean + gain * surprise,
-            covariance: symmetric((Matrix4::identity() - gain * observe) * before.covariance),
-        });
+        let transition = Transition::after(dt_s, settings);
+        let before = states[i - 1].predicted(&transition);
+        let Some(after) = before.updated(seen) else { return states };
+        states.push(after);
         predicted.push((before, transition));
     }
     // Backward.
     for i in (0..states.len() - 1).rev() {
         let (before_next, transition) = predicted[i + 1];
         let Some(inverse) = before_next.covariance.try_inverse() else { continue };
-        let gain = states[i].covariance * transition.transpose() * inverse;
+        let gain = states[i].covariance * transition.matrix.transpose() * inverse;
         let next = states[i + 1];
         states[i] = State {
             mean: states[i].mean + gain * (next.mean - before_next.mean),
@@ -122,31 +95,6 @@ fn rauch_tung_striebel(stamps_ns: &[u64], sightings: &[Mode], settings: &MotionS
         };
     }
     states
-}
-
-fn noise_of(seen: &Mode) -> Matrix2<f64> {
-    let PositionCovariance { ee_m2, en_m2, nn_m2 } = seen.covariance;
-    Matrix2::new(ee_m2, en_m2, en_m2, nn_m2) * FRAMES_ALIKE
-}
-
-/// Transition and covariance of a velocity with white acceleration (Bar-Shalom et al. 2001, section 6.2.2).
-fn constant_velocity(dt_s: f64, settings: &MotionSettings) -> (Matrix4<f64>, Matrix4<f64>) {
-    let q = settings.acceleration_mps2.powi(2);
-    let mut transition = Matrix4::identity();
-    let mut jitter = Matrix4::zeros();
-    for axis in [0, 1] {
-        transition[(axis, axis + 2)] = dt_s;
-        jitter[(axis, axis)] = q * dt_s.powi(3) / 3.0 + JITTER_M.powi(2) * dt_s;
-        jitter[(axis, axis + 2)] = q * dt_s.powi(2) / 2.0;
-        jitter[(axis + 2, axis)] = q * dt_s.powi(2) / 2.0;
-        // Never singular, also between frames of the same instant.
-        jitter[(axis + 2, axis + 2)] = q * dt_s + 1e-9;
-    }
-    (transition, jitter)
-}
-
-fn symmetric(matrix: Matrix4<f64>) -> Matrix4<f64> {
-    (matrix + matrix.transpose()) * 0.5
 }
 
 #[cfg(test)]
@@ -183,7 +131,6 @@ mod tests {
             mean_square_m2(&mut states.iter().zip(&truth_m).map(|(s, t)| distance_m([s.mean[0], s.mean[1]], *t)));
         let single_m2 = mean_square_m2(&mut sightings.iter().zip(&truth_m).map(|(s, t)| distance_m(s.mean_m, *t)));
         assert!(smoothed_m2 < 0.3 * single_m2, "{smoothed_m2} of {single_m2}");
-        // As careful as errors that are alike make it, where these are independent.
         let stated_m2 = states.iter().map(|s| s.covariance[(0, 0)] + s.covariance[(1, 1)]).sum::<f64>() / 200.0;
         assert!((1.0..8.0).contains(&(stated_m2 / smoothed_m2)), "{stated_m2} for {smoothed_m2}");
     }

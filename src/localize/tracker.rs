@@ -1,10 +1,11 @@
 //! From one frame to the next: the discrete Bayes filter, and what may be said of its belief.
 
 use super::belief::{Belief, Mode};
+use super::kalman::{State, Transition};
 use super::motion::{ConstantVelocity, Motion, MotionModel, MotionSettings};
 use super::news::{News, Reach, Worth};
 use super::state::{Evidence, StateMachine};
-use crate::localize::{most_likely_cell, refined_m};
+use crate::localize::{most_likely_cell, refined_m, summit_near};
 use crate::map::{CandidateCells, Compass, FeatureMap, MapInfo};
 use crate::types::{
     EstimateWarnings, EstimatedHeading, EstimatedPose, LocalizationState, NS_PER_S, PositionCovariance,
@@ -53,6 +54,9 @@ pub struct Tracker {
     compass: Option<Compass>,
     belief: Belief,
     motion: Box<dyn MotionModel>,
+    settings: MotionSettings,
+    /// Where in its hill the vehicle is, at the time of the last stamp; `None` while there is no one hill.
+    in_hill: Option<State>,
     states: StateMachine,
     last_stamp_ns: Option<u64>,
     /// Of the last frame that was not skipped.
@@ -101,6 +105,8 @@ impl Tracker {
             compass,
             belief: Belief::uniform(cells),
             motion: Box::new(ConstantVelocity::new(settings)),
+            settings,
+            in_hill: None,
             states: StateMachine::new(info.least_resemblance),
             last_stamp_ns: None,
             last_used_ns: None,
@@ -133,6 +139,7 @@ impl Tracker {
     pub fn start_again(&mut self) {
         self.belief.forget();
         self.motion.observe(None);
+        self.in_hill = None;
         self.states.start_again();
         self.news.forget();
         (self.last_stamp_ns, self.last_used_ns, self.usual_interval_s) = (None, None, None);
@@ -184,7 +191,9 @@ impl Tracker {
         let evidence = Evidence { probability: mode.probability, contradiction, resemblance, share };
         let (state, warnings) = self.states.take(&evidence);
         self.doubt = if warnings.contradiction { DOUBT_IN_CONTRADICTION } else { DOUBT * share };
-        self.follow(&mode);
+        let hill = self.belief.seen_near(mode.mean_m, (1.0 / share) as f32);
+        let seen = Mode { mean_m: self.summit_m(&hill, frame.log_likelihood), ..hill };
+        self.follow(&mode, &seen);
 
         let single_frame_m = match self.refine {
             true => refined_m(&self.cells, frame.log_likelihood, best),
@@ -202,9 +211,17 @@ impl Tracker {
         &self.belief
     }
 
-    /// What the last frame says by itself of the place around `position_m`.
-    pub(super) fn sighting(&self, position_m: PositionM) -> Mode {
-        self.belief.seen_near(position_m, (1.0 / self.last_share) as f32)
+    /// What the last frame, with this log-likelihood, says by itself of the place around `position_m`.
+    pub(super) fn sighting(&self, position_m: PositionM, log_likelihood: &[f32]) -> Mode {
+        let hill = self.belief.seen_near(position_m, (1.0 / self.last_share) as f32);
+        Mode { mean_m: self.summit_m(&hill, log_likelihood), ..hill }
+    }
+
+    /// Where a frame's own hill is highest. Its flanks, which the temperature raises, are known far less well: the mean of
+    /// the hill errs by a fraction of a cell more.
+    fn summit_m(&self, hill: &Mode, log_likelihood: &[f32]) -> PositionM {
+        let summit_m = if self.refine { summit_near(&self.cells, log_likelihood, hill.mean_m) } else { None };
+        summit_m.unwrap_or(hill.mean_m)
     }
 
     /// Moves the belief to the time of a frame, before what that frame says; within `reach`, if pictures show one.
@@ -214,6 +231,8 @@ impl Tracker {
         if dt_s > 0.0 {
             let motion = self.motion_within(dt_s, reach);
             self.belief.spread(motion.mean_m, motion.std_m);
+            let transition = Transition::after(dt_s, &self.settings);
+            self.in_hill = self.in_hill.map(|state| state.predicted(&transition));
         }
         self.belief.doubt(self.doubt);
         self.doubt = 0.0;
@@ -261,23 +280,32 @@ impl Tracker {
         here.map_or(f64::INFINITY, |here| f64::from(best - here) / self.temperature)
     }
 
-    /// Tells the model of the motion what this frame says of the place.
-    fn follow(&mut self, mode: &Mode) {
+    /// Takes what this frame says of the place: `seen`, in the hill `mode` of the belief.
+    fn follow(&mut self, mode: &Mode, seen: &Mode) {
         if mode.probability < TRACKED {
+            self.in_hill = None;
             return self.motion.observe(None);
         }
-        let seen = self.sighting(mode.mean_m);
         let PositionCovariance { ee_m2, en_m2, nn_m2 } = seen.covariance;
         let [ee_m2, en_m2, nn_m2] = [ee_m2, en_m2, nn_m2].map(|variance_m2| variance_m2 / self.last_share);
-        self.motion.observe(Some(&Mode { covariance: PositionCovariance { ee_m2, en_m2, nn_m2 }, ..seen }));
+        let seen = Mode { covariance: PositionCovariance { ee_m2, en_m2, nn_m2 }, ..*seen };
+        self.motion.observe(Some(&seen));
+        // The belief may have gone over to another hill.
+        let reach_m = FITTING_STEPS * self.cells.grid.step_m + FITTING_STDS * ee_m2.max(nn_m2).sqrt();
+        let here = self.in_hill.filter(|state| distance_m(state.position_m(), mode.mean_m) <= reach_m);
+        self.in_hill = here.and_then(|state| state.updated(&seen)).or(Some(State::first(&seen, &self.settings)));
     }
 
     fn pose(&self, mode: &Mode, compass: &[i8]) -> EstimatedPose {
+        let (position_m, covariance) = match &self.in_hill {
+            Some(state) => (state.position_m(), state.position_covariance()),
+            None => (mode.mean_m, mode.covariance),
+        };
         EstimatedPose {
-            position_m: mode.mean_m,
-            covariance: self.with_map_error(mode.covariance),
+            position_m,
+            covariance: self.with_map_error(covariance),
             velocity_mps: self.motion.velocity_mps(),
-            heading: self.heading(mode.mean_m, compass),
+            heading: self.heading(position_m, compass),
         }
     }
 
