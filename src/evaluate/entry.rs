@@ -59,6 +59,9 @@ pub struct Entry {
     pub classified_share: Option<f64>,
     pub bic_all: Option<f64>,
     pub bic_kept: Option<f64>,
+    /// First and last index of every run of test frames, where they were held out in runs: their errors go together.
+    #[serde(skip)]
+    pub held_out_runs: Option<Vec<[usize; 2]>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frames: Option<Vec<FrameEntry>>,
 }

@@ -178,6 +178,7 @@ impl<'a> CaseFrames<'a> {
         };
         // Noise on all positions is also on those that errors are measured against, unless the truth is given.
         let truth_m = protocol.truth_m.unwrap_or(&recorded_m);
+        let indices: Vec<usize> = survey.frames.iter().map(|frame| frame.index).collect();
         let base = Entry {
             dataset: protocol.dataset.into(),
             estimator: "single",
@@ -189,15 +190,10 @@ impl<'a> CaseFrames<'a> {
             n_validation: case.split.validation.len(),
             n_test: case.split.test.len(),
             n_learned_from: case.split.learning.len() + case.split.validation.len(),
+            held_out_runs: held_out_runs(case, &indices),
             ..Entry::default()
         };
-        Self {
-            case,
-            base,
-            test_m: case.split.test.iter().map(|&row| truth_m[row]).collect(),
-            indices: survey.frames.iter().map(|frame| frame.index).collect(),
-            recorded_m,
-        }
+        Self { case, base, test_m: case.split.test.iter().map(|&row| truth_m[row]).collect(), indices, recorded_m }
     }
 
     fn frames(&self) -> Frames<'_> {
@@ -234,6 +230,21 @@ impl<'a> CaseFrames<'a> {
     }
 }
 
+/// First and last index of every run of test frames, unless single frames were drawn.
+fn held_out_runs(case: &Case, indices: &[usize]) -> Option<Vec<[usize; 2]>> {
+    /// Runs this many times as long as chance makes them are meant.
+    const MEANT: f64 = 2.0;
+    let test = &case.split.test;
+    let runs: Vec<&[usize]> = test.chunk_by(|before, next| next - before == 1).collect();
+    let left_share = 1.0 - test.len() as f64 / indices.len() as f64;
+    let in_runs = match case.split_name.as_str() {
+        "random" => false,
+        "blocked" => true,
+        _ => test.len() as f64 * left_share > MEANT * runs.len() as f64,
+    };
+    in_runs.then(|| runs.iter().map(|run| [indices[run[0]], indices[run[run.len() - 1]]]).collect())
+}
+
 /// Which frames features were chosen on.
 pub(super) fn chosen_on(selection: Selection) -> Option<&'static str> {
     match selection {
@@ -257,4 +268,24 @@ pub(super) fn side_by_side(parts: impl Iterator<Item = Mat<f64>>) -> Mat<f64> {
         let (part, column) = places[k];
         parts[part][(i, column)]
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_are_told_from_single_frames() {
+        let indices: Vec<usize> = (0..60).map(|i| 2 * i).collect();
+        let runs = |name: &str, test: &[usize]| {
+            let split = Split { test: test.to_vec(), ..Split::default() };
+            let case = Case { split_name: name.into(), split, seed: None, variant: Variant::Plain };
+            held_out_runs(&case, &indices)
+        };
+        let (scattered, held_out) = ([0, 1, 5, 9, 10, 20], [3, 4, 5, 6, 7, 30, 31, 32, 33, 34]);
+        assert_eq!(runs("random", &held_out), None);
+        assert_eq!(runs("mine.csv", &scattered), None);
+        let expected = Some(vec![[6, 14], [60, 68]]);
+        assert_eq!((runs("mine.csv", &held_out), runs("blocked", &held_out)), (expected.clone(), expected));
+    }
 }

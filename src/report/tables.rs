@@ -372,16 +372,13 @@ fn intervals(dataset: &Dataset) -> Table {
         for method in methods(dataset, split.as_deref()) {
             let Some(statistics) = method.statistics(&dataset.statistics) else { continue };
             let comparison = method.comparison(&dataset.statistics);
-            let three = |estimate: &Estimate| [estimate.value, estimate.low, estimate.high];
-            let mut cells: Vec<Cell> = [&statistics.rmse_m, &statistics.median_m]
-                .into_iter()
-                .flat_map(three)
-                .map(|value| Cell::meters(Some(value)))
-                .collect();
+            let three = |estimate: &Estimate| [Some(estimate.value), estimate.low, estimate.high];
+            let mut cells: Vec<Cell> =
+                [&statistics.rmse_m, &statistics.median_m].into_iter().flat_map(three).map(Cell::meters).collect();
             let difference = comparison.map(|comparison| three(&comparison.mean_difference_m));
-            cells.extend((0..3).map(|i| Cell::meters(difference.map(|values| values[i]))));
+            cells.extend((0..3).map(|i| Cell::meters(difference.and_then(|values| values[i]))));
             cells.push(Cell::percent(comparison.map(|comparison| comparison.closer_share.value)));
-            cells.push(Cell::of(comparison.map(|comparison| comparison.p_holm), p_text));
+            cells.push(Cell::of(comparison.and_then(|comparison| comparison.p_holm), p_text));
             rows.push(Row {
                 label: method.label.clone(),
                 begins_group: group.take(),
@@ -395,10 +392,12 @@ fn intervals(dataset: &Dataset) -> Table {
         id: format!("{}-table-intervals", dataset.id),
         title: format!("Intervals of {:.0} %, and differences on the same frames", 100.0 * level),
         note: format!(
-            "From {} bootstrap draws of stretches of the drive, a twentieth of it each, and of seeds: what other stretches \
+            "From {} bootstrap draws of stretches of the drive, a twentieth of it each, and of seeds; where frames were held \
+             out in runs (blocked split), of whole runs, a run being the same in every seed. A dash: there is but one run, and \
+             nothing can be said. What other stretches \
              and splits of this drive would show, not what other days and places would. Larger by: mean error minus that \
              of the method without an entry there; closer: share of the frames it errs less on; p: of that difference, by \
-             sign flips of stretches, corrected for all comparisons of the table (Holm 1979).",
+             sign flips of stretches or runs (n runs cannot bring it below 2 / 2ⁿ), corrected for all comparisons of the table (Holm 1979).",
             dataset.statistics.draws
         ),
         columns: vec![

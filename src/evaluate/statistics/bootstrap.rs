@@ -1,7 +1,7 @@
 //! Moving blocks along the drive, crossed with the seeds.
 
 use std::borrow::Cow;
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -45,16 +45,71 @@ impl Drive {
     }
 }
 
-/// How often every frame and every seed counts.
+/// What is drawn, and given a sign, as a whole.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Draw {
-    /// Seeds, as often as they were drawn.
-    seeds: Vec<usize>,
-    /// Of the drive's places; `None` where each counts once.
-    times: Option<(Drive, Vec<u8>)>,
+pub enum Units {
+    /// Stretches of the drive: the frames lie all over it.
+    Stretches(Drive),
+    /// Runs of frames that were held out as wholes: first and last index, in order. Runs of several seeds that have frames
+    /// in common are one.
+    Runs(Vec<[usize; 2]>),
 }
 
-impl Draw {
+impl Units {
+    /// Of the frames of `rows`; `None` without frames.
+    pub fn of(rows: &[&Entry]) -> Option<Self> {
+        let drive = Drive::of(rows)?;
+        let mut runs: Vec<[usize; 2]> =
+            rows.iter().flat_map(|entry| entry.held_out_runs.iter().flatten().copied()).collect();
+        if runs.is_empty() {
+            return Some(Self::Stretches(drive));
+        }
+        runs.sort_unstable();
+        let mut united: Vec<[usize; 2]> = Vec::new();
+        for [first, last] in runs {
+            match united.last_mut() {
+                Some(before) if first <= before[1] => before[1] = before[1].max(last),
+                _ => united.push([first, last]),
+            }
+        }
+        Some(Self::Runs(united))
+    }
+
+    /// How many there may be.
+    pub fn most(&self) -> usize {
+        match self {
+            Self::Stretches(_) => STRETCHES,
+            Self::Runs(runs) => runs.len(),
+        }
+    }
+
+    /// The one that a frame is part of.
+    pub fn unit_of(&self, index: usize) -> usize {
+        match self {
+            Self::Stretches(drive) => drive.stretch_of(index),
+            Self::Runs(runs) => runs.partition_point(|run| run[1] < index).min(runs.len() - 1),
+        }
+    }
+
+    /// Where the frame's count is in a draw.
+    fn place_of(&self, index: usize) -> usize {
+        match self {
+            Self::Stretches(drive) => drive.place_of(index),
+            Self::Runs(_) => self.unit_of(index),
+        }
+    }
+}
+
+/// How often every frame and every seed counts.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Draw<'a> {
+    /// Seeds, as often as they were drawn.
+    seeds: Vec<usize>,
+    /// Of the places; `None` where each counts once.
+    times: Option<(&'a Units, Vec<u8>)>,
+}
+
+impl<'a> Draw<'a> {
     /// Everything once.
     pub fn everything(seeds: usize) -> Self {
         Self { seeds: (0..seeds).collect(), times: None }
@@ -70,27 +125,30 @@ impl Draw {
     }
 
     pub fn times(&self, index: usize) -> usize {
-        self.times.as_ref().map_or(1, |(drive, times)| usize::from(times[drive.place_of(index)]))
+        self.times.as_ref().map_or(1, |(units, times)| usize::from(times[units.place_of(index)]))
     }
 }
 
-/// [`DRAWS`] draws of [`STRETCHES`] stretches each and of as many seeds as there are. The first stretch of the drive comes
+/// [`DRAWS`] draws of as many units and seeds as there are. Stretches begin anywhere, and the first one of the drive comes
 /// after the last, so that every frame is drawn equally often.
-pub fn draws(drive: &Drive, seeds: usize, seed: u64) -> Vec<Draw> {
+pub fn draws(units: &Units, seeds: usize, seed: u64) -> Vec<Draw<'_>> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let places = drive.places();
-    let stretch = places.div_ceil(STRETCHES);
+    let (places, length) = match units {
+        Units::Stretches(drive) => (drive.places(), drive.places().div_ceil(STRETCHES)),
+        Units::Runs(runs) => (runs.len(), 1),
+    };
     (0..DRAWS)
         .map(|_| {
             let mut times = vec![0_u8; places];
-            for _ in 0..STRETCHES {
+            for _ in 0..units.most() {
                 let start = random.random_range(0..places);
-                for i in start..start + stretch {
-                    times[i % places] += 1;
+                for i in start..start + length {
+                    let times = &mut times[i % places];
+                    *times = times.saturating_add(1);
                 }
             }
             let seeds = (0..seeds).map(|_| random.random_range(0..seeds)).collect();
-            Draw { seeds, times: Some((*drive, times)) }
+            Draw { seeds, times: Some((units, times)) }
         })
         .collect()
 }
@@ -151,6 +209,12 @@ impl Errors {
     /// Frames with an estimate, all seeds together.
     pub fn frames(&self) -> usize {
         self.seeds.iter().map(|of_seed| of_seed.said.len()).sum()
+    }
+
+    /// Units that these frames are of.
+    pub fn units(&self, units: &Units) -> usize {
+        let said = self.seeds.iter().flat_map(|of_seed| &of_seed.said);
+        said.map(|&(index, _)| units.unit_of(index)).collect::<BTreeSet<usize>>().len()
     }
 
     /// `None` where the draw has no frame with an estimate.
@@ -251,8 +315,8 @@ mod tests {
 
     #[test]
     fn a_draw_counts_every_frame_equally_often_on_average_and_neighbours_together() {
-        let drive = Drive { first: 100, indices: 400 };
-        let draws = draws(&drive, 3, 1);
+        let units = Units::Stretches(Drive { first: 100, indices: 400 });
+        let draws = draws(&units, 3, 1);
         for index in [100, 255, 499] {
             let mean = draws.iter().map(|draw| draw.times(index)).sum::<usize>() as f64 / draws.len() as f64;
             // Four standard deviations of a mean of 2000 Poisson counts.
@@ -264,6 +328,23 @@ mod tests {
         };
         assert!(together(1) > 0.8 && together(10) > 0.3 && together(40).abs() < 0.15);
         assert!(draws.iter().all(|draw| draw.seeds().len() == 3));
+    }
+
+    #[test]
+    fn a_run_that_was_held_out_is_drawn_as_a_whole_whatever_the_seed() {
+        let row = |runs: &[[usize; 2]]| Entry {
+            held_out_runs: Some(runs.to_vec()),
+            ..entry(0, &[(5, Some(1.0)), (70, Some(1.0)), (320, Some(1.0))])
+        };
+        let rows = [row(&[[0, 17], [56, 74]]), row(&[[0, 17], [75, 93], [302, 320]])];
+        let units = Units::of(&rows.iter().collect::<Vec<_>>()).expect("there are frames");
+        assert_eq!(units, Units::Runs(vec![[0, 17], [56, 74], [75, 93], [302, 320]]));
+        assert_eq!([0, 17, 56, 74, 75, 320].map(|index| units.unit_of(index)), [0, 0, 1, 1, 2, 3]);
+        assert!(draws(&units, 2, 0).iter().all(|draw| (0..17).all(|i| draw.times(i) == draw.times(i + 1))));
+        // Two stretches next to each other in one seed are one run of it.
+        let rows = [row(&[[0, 35]]), row(&[[18, 55]]), row(&[[56, 74]])];
+        let units = Units::of(&rows.iter().collect::<Vec<_>>()).expect("there are frames");
+        assert_eq!(units, Units::Runs(vec![[0, 55], [56, 74]]));
     }
 
     #[test]

@@ -3,15 +3,15 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::bootstrap::{Draw, Drive, Errors, Figures};
-use super::{Comparison, Estimate, FLIPS, Method, SIGNIFICANT, STRETCHES, Section};
+use super::bootstrap::{Draw, Errors, Figures, Units};
+use super::{Comparison, Estimate, FLIPS, LEAST_UNITS, Method, SIGNIFICANT, Section};
 
 /// `None` where no frame has an estimate of both.
 pub fn compare(
     section: &Section,
     (method, errors): (&Method, &Errors),
     (reference, of_reference): (&Method, &Errors),
-    drive: &Drive,
+    units: &Units,
     draws: &[Draw],
     seed: u64,
 ) -> Option<Comparison> {
@@ -19,6 +19,8 @@ pub fn compare(
     let as_drawn = Draw::everything(errors.seeds());
     let both = |draw: &Draw| Some((errors.figures(draw)?, of_reference.figures(draw)?));
     let found = both(&as_drawn)?;
+    let of_units = errors.units(units);
+    let draws = if of_units < LEAST_UNITS { &[] } else { draws };
     let drawn: Vec<(Figures, Figures)> = draws.iter().filter_map(both).collect();
     let difference = |of: fn(&Figures) -> f64| {
         let of_pair = |(own, other): &(Figures, Figures)| of(own) - of(other);
@@ -26,13 +28,14 @@ pub fn compare(
     };
     let pairs = pairs(&errors, &of_reference);
     let closer = |draw: &Draw| closer_share(&pairs, draw);
-    let p = sign_flip_p(&stretch_sums(&pairs, drive), seed);
+    let p = (of_units >= LEAST_UNITS).then(|| sign_flip_p(&unit_sums(&pairs, units), seed));
     Some(Comparison {
         section: section.clone(),
         method: method.clone(),
         reference: reference.clone(),
         seeds: errors.seeds(),
         frames: errors.frames(),
+        units: of_units,
         mean_difference_m: difference(|f| f.mean_m),
         median_difference_m: difference(|f| f.median_m),
         closer_share: Estimate::of(closer(&as_drawn)?, draws.iter().filter_map(closer).collect()),
@@ -75,24 +78,32 @@ fn closer_share(pairs: &Pairs, draw: &Draw) -> Option<f64> {
     (!shares.is_empty()).then(|| shares.iter().sum::<f64>() / shares.len() as f64)
 }
 
-/// What every stretch adds to the mean difference over frames and seeds.
-fn stretch_sums(pairs: &Pairs, drive: &Drive) -> [f64; STRETCHES] {
-    let mut sums = [0.0; STRETCHES];
+/// What every unit adds to the mean difference over frames and seeds.
+fn unit_sums(pairs: &Pairs, units: &Units) -> Vec<f64> {
+    let mut sums = vec![0.0; units.most()];
     let seeds = pairs.iter().filter(|of_seed| !of_seed.is_empty()).count();
     for of_seed in pairs {
         for &(index, own_m, other_m) in of_seed {
-            sums[drive.stretch_of(index)] += (own_m - other_m) / (of_seed.len() * seeds) as f64;
+            sums[units.unit_of(index)] += (own_m - other_m) / (of_seed.len() * seeds) as f64;
         }
     }
     sums
 }
 
 /// Share of random signs of the `sums` that make their total as large as it is (Edgington & Onghena 2007: what was found
-/// counts as one of them).
+/// counts as one of them); of all signs there are where those are not more than are drawn.
 fn sign_flip_p(sums: &[f64], seed: u64) -> f64 {
     let found = sums.iter().sum::<f64>().abs();
     // Rounding must not tell apart what is the same.
     let as_large = found * (1.0 - 1e-9);
+    if 1_usize.checked_shl(sums.len() as u32).is_some_and(|all| all <= FLIPS) {
+        let total = |signs: usize| {
+            let signed = sums.iter().enumerate().map(|(i, sum)| if signs >> i & 1 == 0 { *sum } else { -sum });
+            signed.sum::<f64>().abs()
+        };
+        let all = 1 << sums.len();
+        return (0..all).filter(|&signs| total(signs) >= as_large).count() as f64 / all as f64;
+    }
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let flipped = |random: &mut ChaCha8Rng| {
         sums.iter().map(|sum| if random.random::<bool>() { *sum } else { -sum }).sum::<f64>().abs()
@@ -103,14 +114,16 @@ fn sign_flip_p(sums: &[f64], seed: u64) -> f64 {
 
 /// Holm's step-down adjustment: among all `comparisons`, a false discovery of any is as rare as `p_holm` says.
 pub fn with_family_wise_p(mut comparisons: Vec<Comparison>) -> Vec<Comparison> {
-    let mut order: Vec<usize> = (0..comparisons.len()).collect();
-    order.sort_by(|&a, &b| comparisons[a].p.total_cmp(&comparisons[b].p));
+    let mut order: Vec<(usize, f64)> =
+        comparisons.iter().enumerate().filter_map(|(i, comparison)| Some((i, comparison.p?))).collect();
+    order.sort_by(|a, b| a.1.total_cmp(&b.1));
     let mut at_least: f64 = 0.0;
-    for (rank, &i) in order.iter().enumerate() {
-        at_least = at_least.max((order.len() - rank) as f64 * comparisons[i].p).min(1.0);
-        comparisons[i].p_holm = at_least;
+    for (rank, &(i, p)) in order.iter().enumerate() {
+        at_least = at_least.max((order.len() - rank) as f64 * p).min(1.0);
+        comparisons[i].p_holm = Some(at_least);
         let Estimate { low, high, .. } = comparisons[i].mean_difference_m;
-        comparisons[i].is_real = at_least < SIGNIFICANT && (low > 0.0 || high < 0.0);
+        comparisons[i].is_real =
+            at_least < SIGNIFICANT && (low.is_some_and(|low| low > 0.0) || high.is_some_and(|high| high < 0.0));
     }
     comparisons
 }
@@ -132,6 +145,12 @@ mod tests {
         assert_eq!(sign_flip_p(&one, 0), 1.0);
     }
 
+    #[test]
+    fn five_runs_that_all_agree_are_two_of_thirty_two_signs() {
+        assert_eq!(sign_flip_p(&[1.0, 2.0, 0.5, 1.5, 3.0], 0), 2.0 / 32.0);
+        assert_eq!(sign_flip_p(&[1.0, 2.0], 0), 0.5);
+    }
+
     /// Where neither is better, p is below 5 % in 5 % of the cases.
     #[test]
     fn p_is_uniform_under_the_null_hypothesis() {
@@ -148,7 +167,7 @@ mod tests {
 
     #[test]
     fn holm_s_adjustment_equals_a_hand_computed_one() {
-        let unknown = Estimate { value: 1.0, low: 0.5, high: 1.5 };
+        let unknown = Estimate { value: 1.0, low: Some(0.5), high: Some(1.5) };
         let method = Method { recipe: None, features: String::new(), estimator: "single" };
         let comparison = |p: f64| Comparison {
             section: Section { dataset: String::new(), split: None, noisy: false, fixed: false },
@@ -156,21 +175,22 @@ mod tests {
             reference: method.clone(),
             seeds: 1,
             frames: 1,
+            units: 20,
             mean_difference_m: unknown,
             median_difference_m: unknown,
             closer_share: unknown,
-            p,
-            p_holm: p,
+            p: Some(p),
+            p_holm: Some(p),
             is_real: false,
         };
         let adjusted = with_family_wise_p([0.04, 0.01, 0.03, 0.5].map(comparison).into());
-        let found: Vec<f64> = adjusted.iter().map(|c| c.p_holm).collect();
+        let found: Vec<f64> = adjusted.iter().filter_map(|c| c.p_holm).collect();
         for (found, expected) in found.iter().zip([0.09, 0.04, 0.09, 0.5]) {
             assert!((found - expected).abs() < 1e-12, "{found} {expected}");
         }
         assert_eq!(adjusted.iter().map(|c| c.is_real).collect::<Vec<_>>(), [false, true, false, false]);
         // Seeds that disagree leave it open.
-        let open = Comparison { mean_difference_m: Estimate { low: -0.1, ..unknown }, ..comparison(0.01) };
+        let open = Comparison { mean_difference_m: Estimate { low: Some(-0.1), ..unknown }, ..comparison(0.01) };
         assert!(!with_family_wise_p(vec![open])[0].is_real);
     }
 }

@@ -6,10 +6,14 @@
 //! - An **interval** is the span of the middle 95 % of [`DRAWS`] bootstrap figures. For each, stretches of the drive are
 //!   drawn with replacement, the same for all seeds and methods, and the seeds themselves: a moving-block bootstrap along
 //!   the drive (Künsch 1989; circular, Politis & Romano 1992), crossed with one over the splits (Owen 2007). A stretch is a
-//!   twentieth of the drive, as in the blocked split.
+//!   twentieth of the drive, as in the blocked split. Where frames are held out in runs, as in that split, nothing less than
+//!   a run is drawn, with all its seeds: its frames lie equally far from what was learned, and err together.
 //! - A **difference** between two methods is taken on the same frames of the same splits, with the same draws. Its `p` is
-//!   the share of sign flips, one sign a stretch, that make the mean difference of errors as large as it is: how often that
+//!   the share of sign flips, one sign a stretch or run, that make the mean difference of errors as large as it is: how often that
 //!   happens where neither method is better. All comparisons of one table count as one family (Holm 1979).
+//!
+//! Of a single run nothing can be said, and of few runs little: five cannot bring `p` below 2 / 2⁵, and intervals drawn from
+//! them are too short.
 //!
 //! What this assumes: stretches err independently of one another (on `drive-378` the correlation of errors falls below 0.2
 //! within 12 frames, a stretch has 19; where errors stay alike over half a stretch or more, intervals are too short), and under "neither is better" a stretch's difference is
@@ -23,7 +27,7 @@ mod text;
 use serde::Serialize;
 
 use super::entry::Entry;
-use bootstrap::{Draw, Errors, Figures, draws};
+use bootstrap::{Draw, Errors, Figures, Units, draws};
 pub use text::{LEGEND, text};
 
 /// Bootstrap draws.
@@ -34,6 +38,8 @@ pub const FLIPS: usize = 9999;
 pub const LEVEL: f64 = 0.95;
 /// A drive is cut into so many stretches: the blocks that are drawn.
 pub const STRETCHES: usize = crate::train::BLOCKS;
+/// Fewer stretches or runs than these say nothing of others.
+pub const LEAST_UNITS: usize = 2;
 /// Differences with a smaller `p` are called real.
 pub const SIGNIFICANT: f64 = 0.05;
 /// Errors up to these are counted by the recalls \[m\].
@@ -73,12 +79,12 @@ pub struct Method {
     pub estimator: &'static str,
 }
 
-/// A figure, and the interval that holds [`LEVEL`] of its bootstrap draws.
+/// A figure, and the interval that holds [`LEVEL`] of its bootstrap draws; `None` where there is nothing to draw from.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Estimate {
     pub value: f64,
-    pub low: f64,
-    pub high: f64,
+    pub low: Option<f64>,
+    pub high: Option<f64>,
 }
 
 /// Figures of one method, mean over the seeds; of the frames it has an estimate for, but for the recalls, which are of all.
@@ -91,6 +97,8 @@ pub struct MethodStatistics {
     pub seeds: usize,
     /// Test frames with an estimate, all seeds together.
     pub frames: usize,
+    /// Stretches of the drive that they are of, or runs that were held out as wholes.
+    pub units: usize,
     pub rmse_m: Estimate,
     pub mean_m: Estimate,
     pub median_m: Estimate,
@@ -116,16 +124,17 @@ pub struct Comparison {
     pub reference: Method,
     pub seeds: usize,
     pub frames: usize,
+    pub units: usize,
     /// Mean error of `method` minus that of `reference`.
     pub mean_difference_m: Estimate,
     /// The same of the median errors.
     pub median_difference_m: Estimate,
     /// Share of the frames on which `method` errs by less.
     pub closer_share: Estimate,
-    /// Of the mean difference, by sign flips of stretches.
-    pub p: f64,
+    /// Of the mean difference, by sign flips of the units; `None` where there is but one.
+    pub p: Option<f64>,
     /// The same for the family of all comparisons of the section.
-    pub p_holm: f64,
+    pub p_holm: Option<f64>,
     /// `p_holm` is less than [`SIGNIFICANT`], and the interval of the mean difference, which seeds have a part in, does not
     /// hold 0.
     pub is_real: bool,
@@ -172,12 +181,12 @@ impl Statistics {
                 methods.push((method, Errors::of(&seeds)));
             }
         }
-        let Some(drive) = bootstrap::Drive::of(rows) else { return };
+        let Some(units) = Units::of(rows) else { return };
         let seeds = methods.iter().map(|(_, errors)| errors.seeds()).max().unwrap_or(0);
-        let draws = draws(&drive, seeds, SEED);
+        let draws = draws(&units, seeds, SEED);
         let of_median = methods.iter().find(|(method, _)| method.features == "median").map(|(_, errors)| errors);
         for (method, errors) in &methods {
-            self.methods.extend(of_method(section, method, errors, of_median, &draws));
+            self.methods.extend(of_method(section, method, errors, of_median, &units, &draws));
         }
         // The row that the table is about: the last of the last recipe.
         let is_answer = |(method, _): &&(Method, Errors)| method.recipe.is_some() && method.estimator == "single";
@@ -188,7 +197,7 @@ impl Statistics {
             };
             let others = methods.iter().filter(|(method, _)| method != reference && !has_labels(method));
             let compared = others.filter_map(|(method, errors)| {
-                compare::compare(section, (method, errors), (reference, of_reference), &drive, &draws, SEED)
+                compare::compare(section, (method, errors), (reference, of_reference), &units, &draws, SEED)
             });
             self.comparisons.extend(compare::with_family_wise_p(compared.collect()));
         }
@@ -218,10 +227,11 @@ impl Estimate {
         drawn.retain(|value| value.is_finite());
         drawn.sort_by(f64::total_cmp);
         if drawn.is_empty() {
-            return Self { value, low: value, high: value };
+            return Self { value, low: None, high: None };
         }
         let tail = 0.5 * (1.0 - LEVEL);
-        Self { value, low: crate::metrics::quantile(&drawn, tail), high: crate::metrics::quantile(&drawn, 1.0 - tail) }
+        let at = |share: f64| Some(crate::metrics::quantile(&drawn, share));
+        Self { value, low: at(tail), high: at(1.0 - tail) }
     }
 }
 
@@ -230,8 +240,11 @@ fn of_method(
     method: &Method,
     errors: &Errors,
     of_median: Option<&Errors>,
+    units: &Units,
     draws: &[Draw],
 ) -> Option<MethodStatistics> {
+    let of_units = errors.units(units);
+    let draws = if of_units < LEAST_UNITS { &[] } else { draws };
     let as_drawn = Draw::everything(errors.seeds());
     let found = errors.figures(&as_drawn)?;
     let drawn: Vec<Figures> = draws.iter().filter_map(|draw| errors.figures(draw)).collect();
@@ -246,6 +259,7 @@ fn of_method(
         method: method.clone(),
         seeds: errors.seeds(),
         frames: errors.frames(),
+        units: of_units,
         rmse_m: estimate(&|f| f.rmse_m),
         mean_m: estimate(&|f| f.mean_m),
         median_m: estimate(&|f| f.median_m),
@@ -313,14 +327,42 @@ mod tests {
         let fft = &statistics.comparisons[0];
         assert_eq!((fft.reference.features.as_str(), fft.seeds, fft.frames), ("fused", 3, 300));
         let Estimate { value, low, high } = fft.mean_difference_m;
-        assert!([value, low, high].iter().all(|difference| (difference - 0.5).abs() < 1e-9), "{fft:?}");
+        let all = [Some(value), low, high];
+        assert!(all.iter().flatten().filter(|&&difference| (difference - 0.5).abs() < 1e-9).count() == 3, "{fft:?}");
         assert_eq!(fft.closer_share.value, 0.0);
         assert!((statistics.methods[0].emax_m - 3.0).abs() < 1e-3, "{:?}", statistics.methods[0]);
         let fused = &statistics.methods[1];
-        assert!(fused.rmse_m.low < fused.rmse_m.value && fused.rmse_m.value < fused.rmse_m.high, "{fused:?}");
+        assert!(
+            fused.rmse_m.low < Some(fused.rmse_m.value) && Some(fused.rmse_m.value) < fused.rmse_m.high,
+            "{fused:?}"
+        );
         assert!(fused.skill.expect("there is a median").value > 0.9 && fused.rmse_of_seeds_m.len() == 3);
         let lines = text(&statistics).lines().count();
         assert_eq!(lines, 1 + 1 + 1 + 5, "{}", text(&statistics));
+    }
+
+    /// Every frame of every run errs by 1 m more, and yet runs are no more than they are.
+    #[test]
+    fn frames_of_a_run_are_no_witnesses_of_their_own() {
+        let of_runs = |features: &str, error_m: f64, runs: &[[usize; 2]]| {
+            let frames = runs.iter().flat_map(|&[first, last]| first..=last);
+            let errors_m: Vec<(usize, Option<f64>)> =
+                frames.map(|i| (i, Some(error_m + 0.1 * (i % 7) as f64))).collect();
+            let held_out_runs = Some(runs.to_vec());
+            Entry { recipe: Some("default"), features: features.into(), held_out_runs, ..entry(0, &errors_m) }
+        };
+        let compared = |runs: &[[usize; 2]]| {
+            let statistics = Statistics::of(&[of_runs("fft", 2.0, runs), of_runs("fused", 1.0, runs)]);
+            assert!(statistics.methods.iter().all(|method| method.units == runs.len()));
+            (statistics.methods[0].rmse_m, statistics.comparisons[0].clone())
+        };
+        let (rmse_m, comparison) = compared(&[[0, 17], [56, 74], [132, 150], [189, 206], [302, 320]]);
+        assert!(rmse_m.low < Some(rmse_m.value) && Some(rmse_m.value) < rmse_m.high);
+        assert_eq!((comparison.p, comparison.is_real, comparison.units), (Some(0.0625), false, 5));
+        let (rmse_m, comparison) = compared(&[[0, 17]]);
+        assert_eq!((rmse_m.low, rmse_m.high, comparison.p, comparison.p_holm), (None, None, None, None));
+        assert!(comparison.mean_difference_m.low.is_none() && !comparison.is_real);
+        assert!(text(&Statistics::of(&[of_runs("fft", 2.0, &[[0, 17]])])).contains("[-, -]"));
     }
 
     /// Errors of neighbours are alike, over a third of a stretch; the mean over all drives is 5.
@@ -338,11 +380,11 @@ mod tests {
                 .collect();
             let row = entry(0, &errors_m);
             let errors = Errors::of(&[&row]);
-            let drive = bootstrap::Drive::of(&[&row]).expect("there are frames");
+            let units = Units::of(&[&row]).expect("there are frames");
             let drawn =
-                draws(&drive, 1, 0).into_iter().step_by(4).filter_map(|draw| Some(errors.figures(&draw)?.mean_m));
+                draws(&units, 1, 0).into_iter().step_by(4).filter_map(|draw| Some(errors.figures(&draw)?.mean_m));
             let Estimate { low, high, .. } = Estimate::of(5.0, drawn.collect());
-            (low..high).contains(&5.0)
+            low <= Some(5.0) && Some(5.0) < high
         };
         let held = (0..drives).filter(|_| holds(&mut random)).count();
         // A few blocks make intervals a little short: 90 % would be good, and this is three deviations below.

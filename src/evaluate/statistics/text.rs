@@ -50,7 +50,7 @@ fn line(of: &MethodStatistics, comparison: Option<&Comparison>) -> String {
             "{:>24} {:>6.0}% {:>7}{mark}",
             meters(&comparison.mean_difference_m),
             100.0 * comparison.closer_share.value,
-            p_text(comparison.p_holm)
+            comparison.p_holm.map_or("-".into(), p_text)
         )
     });
     let text = format!(
@@ -66,17 +66,19 @@ fn line(of: &MethodStatistics, comparison: Option<&Comparison>) -> String {
 
 /// As in `0.98 [0.91, 1.06]`.
 fn meters(estimate: &Estimate) -> String {
-    let number = |value: f64| match value.abs() {
-        ..9.995 => format!("{value:.2}"),
-        _ => format!("{value:.1}"),
+    let number = |value: Option<f64>| match value {
+        None => "-".into(),
+        Some(value) if value.abs() < 9.995 => format!("{value:.2}"),
+        Some(value) => format!("{value:.1}"),
     };
-    format!("{} [{}, {}]", number(estimate.value), number(estimate.low), number(estimate.high))
+    format!("{} [{}, {}]", number(Some(estimate.value)), number(estimate.low), number(estimate.high))
 }
 
 /// What the columns mean, for under the tables.
 pub const LEGEND: &str = "\
-Intervals: the middle 95 % of bootstrap draws of stretches of the drive, a twentieth of it each, and of seeds. larger by:
+Intervals: the middle 95 % of bootstrap draws of stretches of the drive, a twentieth of it each, and of seeds; where frames
+were held out in runs, of whole runs, which are the same in every seed; none where there is but one. larger by:
 mean error minus that of the method named above, on the same frames; closer: share of the frames it errs less on; p: how
-often signs drawn for the stretches make the mean difference as large, adjusted for all comparisons of the table; * below
+often signs drawn for the stretches or runs make the mean difference as large, adjusted for all comparisons of the table; * below
 0.05. They say what other stretches and splits of this drive would show, not what other days and places would.
 ";

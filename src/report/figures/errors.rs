@@ -79,7 +79,9 @@ pub fn comparison(dataset: &Dataset) -> Drawn {
 
 /// The bootstrap interval of the RMSE \[m\].
 fn interval(dataset: &Dataset, method: &Method) -> Option<[f64; 2]> {
-    method.statistics(&dataset.statistics).map(|statistics| [statistics.rmse_m.low, statistics.rmse_m.high])
+    method
+        .statistics(&dataset.statistics)
+        .and_then(|statistics| Some([statistics.rmse_m.low?, statistics.rmse_m.high?]))
 }
 
 fn refs<'b, 'a>(methods: &'b [Method<'a>]) -> Vec<&'b Method<'a>> {

@@ -46,7 +46,7 @@ pub fn paired(dataset: &Dataset) -> Drawn {
     references.dedup();
     let caption = format!(
         "Mean error of each method minus that of the {}, on the same frames: to the right of zero it is worse. Lines: 95 % of \
-         bootstrap draws of stretches of the drive. Filled: real, with p below 0.05 after Holm’s correction for all \
+         bootstrap draws of stretches of the drive, or of the runs that were held out; none where there is but one. Filled: real, with p below 0.05 after Holm’s correction for all \
          comparisons of the table; hollow: could be chance.",
         references.join(", or the ")
     );
@@ -64,8 +64,8 @@ fn squeezed(difference_m: f64) -> f64 {
 fn panel(title: &str, all: &[Compared], width_px: f64) -> Panel {
     const ROW_PX: f64 = 32.0;
     let values = || all.iter().map(|one| &one.comparison.mean_difference_m);
-    let low = values().map(|estimate| estimate.low).fold(-0.2, f64::min);
-    let high = values().map(|estimate| estimate.high).fold(0.2, f64::max);
+    let low = values().map(|estimate| estimate.low.unwrap_or(estimate.value)).fold(-0.2, f64::min);
+    let high = values().map(|estimate| estimate.high.unwrap_or(estimate.value)).fold(0.2, f64::max);
     let ticks =
         [-100.0, -10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0, 100.0].into_iter().filter(|v| (low..=high).contains(v));
     let ticks = ticks.map(|v: f64| (squeezed(v), number(v, usize::from(v.abs() < 1.0 && v != 0.0))));
@@ -88,7 +88,9 @@ fn panel(title: &str, all: &[Compared], width_px: f64) -> Panel {
     for (i, one) in all.iter().enumerate() {
         let row = all.len() as f64 - i as f64 - 0.68;
         let estimate = &one.comparison.mean_difference_m;
-        plot.segment([squeezed(estimate.low), row], [squeezed(estimate.high), row], Paint::stroke(one.color, 2.0));
+        if let (Some(low), Some(high)) = (estimate.low, estimate.high) {
+            plot.segment([squeezed(low), row], [squeezed(high), row], Paint::stroke(one.color, 2.0));
+        }
         let dot = match one.comparison.is_real {
             true => Paint::fill(one.color).outlined(one.color, 1.4),
             false => Paint::fill("#ffffff").outlined(one.color, 1.4),
@@ -98,8 +100,11 @@ fn panel(title: &str, all: &[Compared], width_px: f64) -> Panel {
         let left = plot.area_at[0] + 2.0;
         plot.label([left, middle], &fitted(&one.label, NOTE.size_px, false, width_px - 150.0), NOTE);
         let sign = if estimate.value > 0.0 { "+" } else { "" };
-        let p = p_text(one.comparison.p_holm);
-        let p = if p.starts_with('<') { format!("p {p}") } else { format!("p = {p}") };
+        let p = match one.comparison.p_holm.map(p_text) {
+            Some(p) if p.starts_with('<') => format!("p {p}"),
+            Some(p) => format!("p = {p}"),
+            None => "p –".into(),
+        };
         let right = plot.area_at[0] + plot.area_size[0];
         let text = format!("{sign}{} m, {p}", meters(estimate.value));
         plot.label([right, middle], &text, LABEL.anchored(Anchor::End));
