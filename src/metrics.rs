@@ -66,9 +66,9 @@ pub fn component_median(positions: &[PositionM]) -> PositionM {
 
 /// What regions of 95 % are worth that held the true position in the share `covered` of so many frames. Between the verdicts
 /// lies what happens by chance in 95 % of such drives, were their frames independent.
-pub fn coverage_verdict(covered: f64, frames: usize) -> &'static str {
+fn coverage_verdict(covered: f64, frames: usize) -> &'static str {
     const STATED: f64 = 0.95;
-    let by_chance = 1.96 * (STATED * (1.0 - STATED) / frames.max(1) as f64).sqrt();
+    let by_chance = BAND_DEVIATIONS * (STATED * (1.0 - STATED) / frames.max(1) as f64).sqrt();
     if covered < STATED - by_chance {
         "over-confident"
     } else if covered > STATED + by_chance {
@@ -76,6 +76,37 @@ pub fn coverage_verdict(covered: f64, frames: usize) -> &'static str {
     } else {
         "as stated"
     }
+}
+
+/// 1.96 standard deviations hold 95 %.
+const BAND_DEVIATIONS: f64 = 1.96;
+
+/// Between these lies the mean NEES of n independent frames with a probability of 95 %: χ² with 2n degrees of freedom over
+/// n, by the cube root of Wilson and Hilferty (1931).
+pub fn nees_bounds(n: usize) -> [f64; 2] {
+    let freedom = 2.0 * n as f64;
+    let bound = |z: f64| {
+        let a = 2.0 / (9.0 * freedom);
+        2.0 * (1.0 - a + z * a.sqrt()).powi(3)
+    };
+    [bound(-BAND_DEVIATIONS), bound(BAND_DEVIATIONS)]
+}
+
+/// What a stated uncertainty is worth whose regions of 95 % held the true position in the share `covered` of so many frames,
+/// and whose NEES was so much on average: both must agree. As in `mixed: as stated by coverage, too cautious by NEES`.
+pub fn uncertainty_verdict(covered: f64, nees_mean: Option<f64>, frames: usize) -> String {
+    let by_coverage = coverage_verdict(covered, frames);
+    let [low, high] = nees_bounds(frames.max(1));
+    let by_nees = match nees_mean {
+        None => by_coverage,
+        Some(nees) if nees < low => "too cautious",
+        Some(nees) if nees <= high => "as stated",
+        Some(_) => "over-confident",
+    };
+    if by_nees == by_coverage {
+        return by_coverage.into();
+    }
+    format!("mixed: {by_coverage} by coverage, {by_nees} by NEES")
 }
 
 pub(crate) fn root_mean_square(values: &[f64]) -> f64 {
@@ -131,6 +162,24 @@ mod tests {
         ] {
             assert_eq!(coverage_verdict(covered, frames), expected, "{covered} of {frames}");
         }
+    }
+
+    #[test]
+    fn bounds_of_the_mean_nees_are_those_of_chi_square() {
+        // Quantiles of χ²(200) at 2.5 and 97.5 %: 162.728, 241.058 (scipy.stats.chi2.ppf).
+        let [low, high] = nees_bounds(100);
+        assert!((low - 1.627_28).abs() < 2e-3 && (high - 2.410_58).abs() < 2e-3, "{low} {high}");
+    }
+
+    #[test]
+    fn coverage_and_nees_must_agree() {
+        let verdict = |covered: f64, nees: f64| uncertainty_verdict(covered, Some(nees), 100);
+        assert_eq!(verdict(0.95, 2.0), "as stated");
+        assert_eq!(verdict(0.8, 6.0), "over-confident");
+        assert_eq!(verdict(1.0, 0.4), "too cautious");
+        assert_eq!(verdict(0.96, 0.4), "mixed: as stated by coverage, too cautious by NEES");
+        assert_eq!(verdict(0.96, f64::INFINITY), "mixed: as stated by coverage, over-confident by NEES");
+        assert_eq!(uncertainty_verdict(0.8, None, 100), "over-confident");
     }
 
     #[test]

@@ -21,7 +21,7 @@ use crate::evaluate::{
 };
 use crate::features::Descriptor;
 use crate::map::{Recipe, RecipeName, Selection, Smoothing, SplitKind};
-use crate::metrics::coverage_verdict;
+use crate::metrics::uncertainty_verdict;
 use crate::recording::{Recording, write_bytes_atomically};
 use crate::train::{Outcomes, Similarity, Split, Survey, TrackSmoother, Trial};
 use crate::types::counted;
@@ -259,7 +259,7 @@ fn in_words(entries: &[Entry]) -> String {
             entry.estimator,
             100.0 * covered,
             counted(frames, "frame"),
-            coverage_verdict(covered, frames)
+            uncertainty_verdict(covered, entry.nees_mean, frames)
         );
         if let Some(nees) = entry.nees_mean {
             text += &format!("; mean NEES {nees:.2} (2 is exact)");

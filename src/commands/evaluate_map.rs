@@ -16,7 +16,7 @@ use crate::evaluate::{Evaluation, MapComparison, PositionShift, Statistics, map_
 use crate::map::{FeatureMap, file};
 use crate::recording::Recording;
 use crate::train::Survey;
-use crate::types::{PositionM, counted};
+use crate::types::{PositionM, counted, distance_m};
 
 /// Every frame of `recording` against a map.
 pub fn on_map(
@@ -40,6 +40,7 @@ pub fn on_map(
         .with_context(|| format!("{} against {}", recording.path.display(), path.display()))?;
     let truth_m = truth(args, &survey)?;
     warnings.extend(args.truth.as_ref().and_then(|path| elsewhere(path, &truth_m, &survey)));
+    warnings.extend(off_the_map(&recording.name, path, &map, &truth_m));
     let mut entries = map_entries(&recording.name, &survey, &map, &truth_m);
     let learned = if args.survey.is_empty() { Vec::new() } else { open_surveys(args, path, &map, &mut warnings)? };
     warnings.iter().for_each(|warning| eprintln!("warning: {}", printable(warning)));
@@ -78,6 +79,23 @@ pub fn on_map(
     let section = Section { dataset: recording.name.clone(), split: None, noisy: false, fixed: false };
     let shifts = PositionShift::of_map(&section, &map.info, &map.positions_m, &known.collect::<Vec<_>>());
     Ok(Evaluation { entries, statistics, assignments: rows.assignments, shifts, warnings, inputs: Vec::new() })
+}
+
+/// Said where most of the positions lie outside all cells: nothing there can be found.
+fn off_the_map(name: &str, path: &Path, map: &FeatureMap, truth_m: &[PositionM]) -> Option<String> {
+    let centers_m = map.cells.centers_m();
+    let is_near = |position_m: &PositionM| {
+        centers_m.iter().any(|&center_m| distance_m(center_m, *position_m) <= map.cells.grid.step_m)
+    };
+    let off = truth_m.iter().filter(|position_m| !is_near(position_m)).count();
+    (2 * off > truth_m.len()).then(|| {
+        format!(
+            "{off} of the {} positions of {name} lie outside the cells of {}: no frame can be found there; is it a map of this \
+             place, from the same origin?",
+            truth_m.len(),
+            path.display()
+        )
+    })
 }
 
 /// `recording` with its positions counted from the map's origin.

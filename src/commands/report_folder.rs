@@ -18,8 +18,8 @@ const DRAWING: &str = ".drawing-";
 /// A folder that can be written to.
 pub struct ReportFolder {
     path: PathBuf,
-    /// Removed when dropped.
-    drawing: TempDir,
+    /// Made when drawing begins, removed when dropped.
+    drawing: Option<TempDir>,
     /// Made for this report: removed again if nothing comes of it.
     is_new: bool,
 }
@@ -38,44 +38,50 @@ impl ReportFolder {
         if is_new {
             fs::create_dir(path).map_err(|error| cannot("make", error))?;
         }
-        let drawing = tempfile::Builder::new().prefix(DRAWING).tempdir_in(path);
-        let drawing = drawing.map_err(|error| {
+        remove_left_over(path, None);
+        // Evaluating takes long: whether it can be written to is tried now, but nothing is left there meanwhile.
+        new_drawing(path).map_err(|error| {
             if is_new {
                 _ = fs::remove_dir(path);
             }
             cannot("write to", error)
         })?;
-        Ok(Self { path: path.into(), drawing, is_new })
+        Ok(Self { path: path.into(), drawing: None, is_new })
     }
 
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Where the new report is drawn.
-    pub fn drawing(&self) -> &Path {
-        self.drawing.path()
+    /// Where the new report is drawn from now on.
+    pub fn drawing(&mut self) -> std::io::Result<PathBuf> {
+        let drawing = match self.drawing.take() {
+            Some(drawing) => drawing,
+            None => new_drawing(&self.path)?,
+        };
+        Ok(self.drawing.insert(drawing).path().into())
     }
 
     /// Puts what was drawn in the place of what was there; returns the page.
     pub fn show(mut self) -> anyhow::Result<PathBuf> {
-        let old = self.drawing().join("old");
+        let drawing = self.drawing()?;
+        let old = drawing.join("old");
         fs::create_dir(&old).with_context(|| format!("making the folder {}", old.display()))?;
         // The page goes first and comes last: where there is one, there is everything it refers to.
         let mut away = [PAGE, JSON, FIGURES].into_iter();
         let mut here = [FIGURES, JSON, PAGE].into_iter();
         let replaced = away
             .try_for_each(|name| move_if_there(&self.path.join(name), &old.join(name)))
-            .and_then(|()| here.try_for_each(|name| move_if_there(&self.drawing().join(name), &self.path.join(name))));
+            .and_then(|()| here.try_for_each(|name| move_if_there(&drawing.join(name), &self.path.join(name))));
         if replaced.is_err() {
             for name in [FIGURES, JSON, PAGE].into_iter().filter(|name| old.join(name).exists()) {
-                _ = move_if_there(&self.path.join(name), &self.drawing().join(name));
+                _ = move_if_there(&self.path.join(name), &drawing.join(name));
                 _ = move_if_there(&old.join(name), &self.path.join(name));
             }
         }
         replaced?;
         self.is_new = false;
-        remove_left_over(&self.path, Some(self.drawing()));
+        remove_left_over(&self.path, Some(&drawing));
         Ok(self.path.join(PAGE))
     }
 }
@@ -83,11 +89,15 @@ impl ReportFolder {
 impl Drop for ReportFolder {
     fn drop(&mut self) {
         if self.is_new {
-            _ = fs::remove_dir_all(self.drawing.path());
+            drop(self.drawing.take());
             // Not if anything else has come into it.
             _ = fs::remove_dir(&self.path);
         }
     }
+}
+
+fn new_drawing(folder: &Path) -> std::io::Result<TempDir> {
+    tempfile::Builder::new().prefix(DRAWING).tempdir_in(folder)
 }
 
 fn move_if_there(from: &Path, to: &Path) -> anyhow::Result<()> {
@@ -187,13 +197,14 @@ mod tests {
         write(&folder, "old.svg", "old");
         // Of a run that was cut off.
         fs::create_dir(folder.join(".drawing-abc")).expect("a folder");
-        let failed = ReportFolder::open(&folder, true).expect("it can be replaced");
-        write(failed.drawing(), "new.svg", "new");
+        let mut failed = ReportFolder::open(&folder, true).expect("it can be replaced");
+        assert_eq!(names(&folder), [FIGURES, PAGE, JSON], "nothing is left over, and nothing drawn yet");
+        write(&failed.drawing().expect("it can be written to"), "new.svg", "new");
         drop(failed);
         assert_eq!(fs::read(folder.join(PAGE)).expect("readable"), b"old");
 
-        let replaced = ReportFolder::open(&folder, true).expect("it can be replaced");
-        write(replaced.drawing(), "new.svg", "new");
+        let mut replaced = ReportFolder::open(&folder, true).expect("it can be replaced");
+        write(&replaced.drawing().expect("it can be written to"), "new.svg", "new");
         let page = replaced.show().expect("replaces");
         assert_eq!(fs::read(page).expect("readable"), b"new");
         assert_eq!(names(&folder), [FIGURES, PAGE, JSON]);
@@ -204,8 +215,8 @@ mod tests {
     fn a_folder_that_comes_to_nothing_is_not_left() {
         let temporary = tempfile::tempdir().expect("a temporary folder");
         let folder = temporary.path().join("report");
-        let failed = ReportFolder::open(&folder, false).expect("it can be made");
-        write(failed.drawing(), "new.svg", "new");
+        let mut failed = ReportFolder::open(&folder, false).expect("it can be made");
+        write(&failed.drawing().expect("it can be written to"), "new.svg", "new");
         assert!(folder.is_dir());
         drop(failed);
         assert!(!folder.exists());

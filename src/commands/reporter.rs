@@ -81,7 +81,7 @@ impl Reporter {
     }
 
     /// Writes the report; returns its page.
-    pub fn write(self, recordings: &[Recording], progress: &Progress) -> anyhow::Result<PathBuf> {
+    pub fn write(mut self, recordings: &[Recording], progress: &Progress) -> anyhow::Result<PathBuf> {
         let now_s = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
         let report = Report {
             program: env!("CARGO_PKG_VERSION").into(),
@@ -98,7 +98,8 @@ impl Reporter {
         };
         let path = self.folder.path().to_path_buf();
         let context = || format!("writing the report {}", path.display());
-        report.write(self.folder.drawing(), recordings, &self.learned, on_step).with_context(context)?;
+        let drawing = self.folder.drawing().with_context(context)?;
+        report.write(&drawing, recordings, &self.learned, on_step).with_context(context)?;
         self.folder.show().with_context(context)
     }
 }

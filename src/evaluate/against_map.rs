@@ -5,13 +5,13 @@ use rayon::prelude::*;
 
 use super::entry::Entry;
 use super::protocol::{chosen_on, compression};
-use super::sequence::{Sequence, SequenceFigures, sequences};
+use super::sequence::{Sequence, SequenceFigures, nees, sequences};
 use crate::features::COMPASS_BYTES;
 use crate::localize::{MapFields, Observation};
-use crate::map::FeatureMap;
+use crate::map::{CandidateCells, FeatureMap};
 use crate::metrics::{ErrorFigures, component_median};
 use crate::train::{Survey, covers, locate};
-use crate::types::PositionM;
+use crate::types::{PositionCovariance, PositionM};
 
 /// Single-frame estimates from one group of the map, or from all of them fused.
 #[derive(Debug, Clone)]
@@ -24,6 +24,8 @@ pub struct MapOutcome {
     /// Share of frames whose true position lies in the region that holds 95 % of the probability, at the map's
     /// temperature; `None` for a group that is only a part of the answer.
     pub coverage_95: Option<f64>,
+    /// Mean NEES by the covariance of the same probabilities; `None` alike.
+    pub nees_mean: Option<f64>,
 }
 
 /// What became of a drive on a map.
@@ -65,6 +67,7 @@ pub fn map_entries(dataset: &str, survey: &Survey, map: &FeatureMap, truth_m: &[
             kept: Some(outcome.kept),
             compression: compression(outcome.m, outcome.kept),
             coverage_95: outcome.coverage_95,
+            nees_mean: outcome.nees_mean,
             ..base.clone()
         };
         let figures = ErrorFigures::of(&outcome.estimates_m, truth_m, know_nothing_m);
@@ -113,13 +116,18 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
             }
             log_likelihood.fill(0.0);
             fields.add_log_likelihood(&features, scratch, &mut log_likelihood);
-            estimates_m.push(locate(&map.cells, &log_likelihood, map.info.refine));
-            let is_covered = covers(&map.cells, &log_likelihood, truth_m[row], map.info.temperature, 0.95);
+            let estimate_m = locate(&map.cells, &log_likelihood, map.info.refine);
+            estimates_m.push(estimate_m);
+            let temperature = map.info.temperature;
+            let is_covered = covers(&map.cells, &log_likelihood, truth_m[row], temperature, 0.95);
+            let covariance = covariance_about(&map.cells, &log_likelihood, temperature, estimate_m);
+            let nees = nees(&covariance, estimate_m, truth_m[row]);
             let nowhere = MapFields::log_likelihood_nowhere(groups, &features);
-            Answer { estimates_m, is_covered, features, log_likelihood, nowhere }
+            Answer { estimates_m, is_covered, nees, features, log_likelihood, nowhere }
         })
         .collect();
     let covered = answers.iter().filter(|answer| answer.is_covered).count() as f64 / survey.len().max(1) as f64;
+    let nees_mean = answers.iter().map(|answer| answer.nees).sum::<f64>() / survey.len().max(1) as f64;
 
     let column = |i: usize| answers.iter().map(|answer| answer.estimates_m[i]).collect();
     let mut outcomes: Vec<MapOutcome> = map
@@ -134,6 +142,7 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
             kept: group.features,
             estimates_m: column(i),
             coverage_95: (groups.len() == 1).then_some(covered),
+            nees_mean: (groups.len() == 1).then_some(nees_mean),
         })
         .collect();
     if outcomes.len() > 1 {
@@ -145,6 +154,7 @@ pub fn against_map(survey: &Survey, map: &FeatureMap, truth_m: &[PositionM]) -> 
             kept: total(|outcome| outcome.kept),
             estimates_m: column(outcomes.len()),
             coverage_95: Some(covered),
+            nees_mean: Some(nees_mean),
         });
     }
     AgainstMap { single: outcomes, sequences: in_order(survey, map, &answers) }
@@ -155,6 +165,7 @@ struct Answer {
     /// One a group, and the fused one last.
     estimates_m: Vec<PositionM>,
     is_covered: bool,
+    nees: f64,
     features: Vec<f32>,
     log_likelihood: Vec<f32>,
     nowhere: Option<f32>,
@@ -183,4 +194,29 @@ fn in_order(survey: &Survey, map: &FeatureMap, answers: &[Answer]) -> Vec<Sequen
         })
         .collect();
     sequences(map, &frames).into()
+}
+
+/// Σ p (c − s)(c − s)ᵀ over the cells c, with p ∝ exp(log-likelihood / temperature), and what a cell's own size adds.
+pub fn covariance_about(
+    cells: &CandidateCells,
+    log_likelihood: &[f32],
+    temperature: f64,
+    about_m: PositionM,
+) -> PositionCovariance {
+    let greatest = log_likelihood.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let (mut total, mut ee, mut en, mut nn) = (0.0, 0.0, 0.0, 0.0);
+    for (i, &value) in log_likelihood.iter().enumerate() {
+        let p = (f64::from(value - greatest) / temperature).exp();
+        if p > 0.0 {
+            let center_m = cells.center_m(i);
+            let [e, n] = [center_m[0] - about_m[0], center_m[1] - about_m[1]];
+            total += p;
+            ee += p * e * e;
+            en += p * e * n;
+            nn += p * n * n;
+        }
+    }
+    // Variance of a uniform distribution over a cell.
+    let of_cell_m2 = cells.grid.step_m.powi(2) / 12.0;
+    PositionCovariance { ee_m2: ee / total + of_cell_m2, en_m2: en / total, nn_m2: nn / total + of_cell_m2 }
 }

@@ -11,13 +11,13 @@ mod sequence;
 mod shifts;
 pub mod statistics;
 
-pub use against_map::{AgainstMap, MapOutcome, against_map, map_entries};
+pub use against_map::{AgainstMap, MapOutcome, against_map, covariance_about, map_entries};
 pub use baselines::WordAssignment;
 pub use entry::{Entry, FrameEntry, LEGEND, emax_m, table};
 pub use input::InputFile;
 pub use map_baselines::MapComparison;
 pub use protocol::{Case, CaseResults, Protocol, Variant};
-pub use sequence::{Sequence, SequenceFigures, SequencePose};
+pub use sequence::{Sequence, SequenceFigures, SequencePose, nees};
 pub use shifts::PositionShift;
 pub use statistics::Statistics;
 

@@ -74,7 +74,7 @@ impl SequenceFigures {
     pub fn of(sequence: &Sequence, stamps_ns: &[u64], truth_m: &[PositionM], yaws_rad: &[Option<f64>]) -> Option<Self> {
         let first = sequence.poses.iter().position(Option::is_some)?;
         let posed = || sequence.poses.iter().enumerate().filter_map(|(i, pose)| Some((i, pose.as_ref()?)));
-        let nees: Vec<f64> = posed().map(|(i, pose)| nees(pose, truth_m[i])).collect();
+        let nees: Vec<f64> = posed().map(|(i, pose)| nees(&pose.covariance, pose.position_m, truth_m[i])).collect();
         let n = nees.len() as f64;
         let mut headings_deg: Vec<f64> = posed()
             .filter_map(|(i, pose)| Some(wrap_angle_rad(pose.heading?.yaw_rad - yaws_rad[i]?).to_degrees().abs()))
@@ -92,9 +92,9 @@ impl SequenceFigures {
 }
 
 /// eᵀ P⁻¹ e.
-fn nees(pose: &SequencePose, truth_m: PositionM) -> f64 {
-    let PositionCovariance { ee_m2, en_m2, nn_m2 } = pose.covariance;
-    let (e, n) = (pose.position_m[0] - truth_m[0], pose.position_m[1] - truth_m[1]);
+pub fn nees(covariance: &PositionCovariance, estimate_m: PositionM, truth_m: PositionM) -> f64 {
+    let PositionCovariance { ee_m2, en_m2, nn_m2 } = *covariance;
+    let (e, n) = (estimate_m[0] - truth_m[0], estimate_m[1] - truth_m[1]);
     (nn_m2 * e * e - 2.0 * en_m2 * e * n + ee_m2 * n * n) / (ee_m2 * nn_m2 - en_m2 * en_m2)
 }
 

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::evaluate::{Case, FrameEntry};
+use crate::evaluate::{Case, FrameEntry, covariance_about, nees};
 use crate::features::Descriptor;
 use crate::gp::{GpError, Hyperparameters, LearningPositions};
 use crate::localize::{FieldOnCells, MapFields};
@@ -256,38 +256,6 @@ fn answer(
         credible_level: credible_level(cells, log_likelihood, truth_m, temperature),
         nees: nees(&covariance, estimate_m, truth_m),
     }
-}
-
-/// Σ p (c − s)(c − s)ᵀ over the cells c, with p ∝ exp(log-likelihood / temperature), and what a cell's own size adds.
-fn covariance_about(
-    cells: &CandidateCells,
-    log_likelihood: &[f32],
-    temperature: f64,
-    about_m: PositionM,
-) -> PositionCovariance {
-    let greatest = log_likelihood.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    let (mut total, mut ee, mut en, mut nn) = (0.0, 0.0, 0.0, 0.0);
-    for (i, &value) in log_likelihood.iter().enumerate() {
-        let p = (f64::from(value - greatest) / temperature).exp();
-        if p > 0.0 {
-            let center_m = cells.center_m(i);
-            let [e, n] = [center_m[0] - about_m[0], center_m[1] - about_m[1]];
-            total += p;
-            ee += p * e * e;
-            en += p * e * n;
-            nn += p * n * n;
-        }
-    }
-    // Variance of a uniform distribution over a cell.
-    let of_cell_m2 = cells.grid.step_m.powi(2) / 12.0;
-    PositionCovariance { ee_m2: ee / total + of_cell_m2, en_m2: en / total, nn_m2: nn / total + of_cell_m2 }
-}
-
-/// eᵀ P⁻¹ e.
-pub fn nees(covariance: &PositionCovariance, estimate_m: PositionM, truth_m: PositionM) -> f64 {
-    let PositionCovariance { ee_m2, en_m2, nn_m2 } = *covariance;
-    let (e, n) = (estimate_m[0] - truth_m[0], estimate_m[1] - truth_m[1]);
-    (nn_m2 * e * e - 2.0 * en_m2 * e * n + ee_m2 * n * n) / (ee_m2 * nn_m2 - en_m2 * en_m2)
 }
 
 /// The frames whose likelihood is shown: an ordinary one, one that is hard, and the worst.

@@ -56,24 +56,17 @@ pub fn covers(
     temperature: f64,
     probability: f64,
 ) -> bool {
-    likelier_and_own(cells, log_likelihood, truth_m, temperature)[0] < probability
+    credible_level(cells, log_likelihood, truth_m, temperature) < probability
 }
 
 /// Where `truth_m` lies in the regions that hold more and more: the probability of all cells that are likelier than the one
-/// nearest to it, and half of that cell's own, as the place within a cell is not told apart. Uniform in 0..1 over frames where
-/// the probabilities are right, but for the size of a cell.
+/// nearest to it. A region of `probability` holds whole cells, up to the one with which it is reached, and covers all levels
+/// below: a little more than was asked for where cells are coarse.
 pub fn credible_level(cells: &CandidateCells, log_likelihood: &[f32], truth_m: PositionM, temperature: f64) -> f64 {
-    let [likelier, own] = likelier_and_own(cells, log_likelihood, truth_m, temperature);
-    likelier + 0.5 * own
-}
-
-/// Probability of all cells that are likelier than the one nearest `truth_m`, and of that one.
-fn likelier_and_own(cells: &CandidateCells, log_likelihood: &[f32], truth_m: PositionM, temperature: f64) -> [f64; 2] {
     let relative = relative_probabilities(log_likelihood, temperature);
     let at_truth = relative[nearest_cell(&cells.centers_m(), truth_m)];
     let likelier: f64 = relative.iter().filter(|&&p| p > at_truth).sum();
-    let total: f64 = relative.iter().sum();
-    [likelier / total, at_truth / total]
+    likelier / relative.iter().sum::<f64>()
 }
 
 /// −log of the mean probability of the cells `there`, by their weights, which sum to 1.

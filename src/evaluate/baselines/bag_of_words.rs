@@ -12,7 +12,6 @@ use super::codebook::Codebook;
 use super::rows::Frames;
 use super::views::LocalDescriptors;
 use crate::evaluate::statistics::Section;
-use crate::metrics::component_median;
 use crate::types::{PositionM, distance_m};
 
 /// Numbers of words that are tried: the paper's “different sizes of clusters”.
@@ -129,24 +128,21 @@ impl BagOfWords {
         Some((answers, Votes { learned, labels, voters, predicted, words }))
     }
 
-    /// The same words asked where the vehicle is: the median position of the k nearest learning images (of one: its own
-    /// position). Words are learned from the learning frames only; their number and k are those with the least mean error
-    /// on the validation frames, which are then learned from too.
+    /// The same words asked where the vehicle is: the position of the nearest learning image. Words are learned from the
+    /// learning frames only; their number is that with the least mean error on the validation frames, which are then learned
+    /// from too.
     pub fn nearest(&self, frames: &Frames) -> WordAnswers {
         let tried = WORDS.iter().map(|&words| {
             let histograms = Histograms::learn(&self.local, frames.learning, words);
-            let scores = NEIGHBOURS.map(|k| {
-                let found_m = histograms.positions_m(frames, frames.validation, frames.learning, k);
-                let errors = found_m.iter().zip(frames.validation);
-                errors.map(|(&found_m, &row)| distance_m(found_m, frames.recorded_m[row])).sum::<f64>()
-            });
-            let best = (0..NEIGHBOURS.len()).min_by(|&a, &b| scores[a].total_cmp(&scores[b])).unwrap_or(0);
-            (scores[best], NEIGHBOURS[best], histograms)
+            let found_m = histograms.positions_m(frames, frames.validation, frames.learning);
+            let errors = found_m.iter().zip(frames.validation);
+            let score = errors.map(|(&found_m, &row)| distance_m(found_m, frames.recorded_m[row])).sum::<f64>();
+            (score, histograms)
         });
         let best = tried.reduce(|best, next| if next.0 < best.0 { next } else { best });
-        let (_, neighbours, histograms) = best.expect("some numbers are tried");
-        let estimates_m = histograms.positions_m(frames, frames.test, &frames.learned_from(), neighbours);
-        WordAnswers { estimates_m, words: histograms.words, neighbours }
+        let (_, histograms) = best.expect("some numbers are tried");
+        let estimates_m = histograms.positions_m(frames, frames.test, &frames.learned_from());
+        WordAnswers { estimates_m, words: histograms.words, neighbours: 1 }
     }
 }
 
@@ -264,10 +260,9 @@ impl Histograms {
         queries.par_iter().map(near).collect()
     }
 
-    fn positions_m(&self, frames: &Frames, queries: &[usize], rows: &[usize], k: usize) -> Vec<PositionM> {
-        let position_m =
-            |near: &Vec<usize>| component_median(&near.iter().map(|&row| frames.recorded_m[row]).collect::<Vec<_>>());
-        self.nearest(queries, rows, k).iter().map(position_m).collect()
+    /// Of the nearest of `rows` to each of `queries`.
+    fn positions_m(&self, frames: &Frames, queries: &[usize], rows: &[usize]) -> Vec<PositionM> {
+        self.nearest(queries, rows, 1).iter().map(|near| frames.recorded_m[near[0]]).collect()
     }
 }
 
@@ -318,6 +313,10 @@ mod tests {
         let answers = words.nearest(&frames);
         let errors_m: Vec<f64> = answers.estimates_m.iter().zip(&test_m).map(|(&a, &b)| distance_m(a, b)).collect();
         assert!(errors_m.iter().all(|&error_m| error_m <= 1.0), "{answers:?}");
+        assert_eq!(answers.neighbours, 1);
+        // Every answer is where an image was taken.
+        let learned_m = frames.positions_m(&frames.learned_from());
+        assert!(answers.estimates_m.iter().all(|estimate_m| learned_m.contains(estimate_m)), "{answers:?}");
 
         let (paper, votes) = words.paper(&frames).expect("labels");
         assert_eq!(votes.classified_share(), 1.0, "{votes:?}");

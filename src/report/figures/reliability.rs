@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use crate::metrics::coverage_verdict;
+use crate::metrics::{nees_bounds, uncertainty_verdict};
 use crate::report::chart::color::{FAINT, INK};
 use crate::report::chart::plot::{Axis, Key, LABEL, LegendItem, NOTE, Panel, Plot, Spec};
 use crate::report::chart::scale::{Scale, number};
@@ -33,12 +33,11 @@ pub fn reliability(dataset: &Dataset) -> Drawn {
         let mut levels: Vec<f64> = series.answers.iter().map(|a| a.credible_level).collect();
         nees.sort_unstable_by(f64::total_cmp);
         levels.sort_unstable_by(f64::total_cmp);
-        let n = nees.len() as f64;
         let bounds = nees_bounds(nees.len());
         json!({
             "estimates": series.label,
             "frames": nees.len(),
-            "nees_mean": nees.iter().sum::<f64>() / n,
+            "nees_mean": mean_nees(series),
             "nees_median": nees[nees.len() / 2],
             "nees_mean_bounds_95": bounds,
             "nees": nees,
@@ -46,13 +45,14 @@ pub fn reliability(dataset: &Dataset) -> Drawn {
             "coverage_50": coverage(&levels, 0.5),
             "coverage_90": coverage(&levels, 0.9),
             "coverage_95": coverage(&levels, 0.95),
-            "verdict": coverage_verdict(coverage(&levels, 0.95), levels.len()),
+            "verdict": uncertainty_verdict(coverage(&levels, 0.95), Some(mean_nees(series)), levels.len()),
         })
     });
     let data: Vec<_> = data.collect();
     let verdicts: Vec<String> = series.iter().map(verdict).collect();
     let caption = format!(
-        "Regions that should hold the truth in 95 % of the frames hold it in {}. Left: a curve on the dashed line keeps its promise; below it the regions \
+        "Regions that should hold the truth in 95 % of the frames hold it in {}. The words judge by that share and by the mean NEES, each \
+         against what chance leaves to independent frames. Left: a curve on the dashed line keeps its promise; below it the regions \
          are too small (over-confident), above it too large. Right: the normalised error squared should follow χ² with two \
          degrees of freedom, of median 1.4 and mean 2; a curve further right is over-confident, further left too cautious. \
          Gray: where 95 % of such curves lie by chance.",
@@ -93,23 +93,16 @@ fn verdict(series: &Series) -> String {
         number(100.0 * covered, 0),
         levels.len(),
         series.label,
-        coverage_verdict(covered, levels.len())
+        uncertainty_verdict(covered, Some(mean_nees(series)), levels.len())
     )
+}
+
+fn mean_nees(series: &Series) -> f64 {
+    series.answers.iter().map(|a| a.nees).sum::<f64>() / series.answers.len() as f64
 }
 
 fn coverage(levels: &[f64], nominal: f64) -> f64 {
     levels.iter().filter(|&&level| level < nominal).count() as f64 / levels.len() as f64
-}
-
-/// Between these lies the mean NEES of n independent frames with a probability of 95 %: χ² with 2n degrees of freedom over
-/// n, by the cube root of Wilson and Hilferty (1931).
-fn nees_bounds(n: usize) -> [f64; 2] {
-    let freedom = 2.0 * n as f64;
-    let bound = |z: f64| {
-        let a = 2.0 / (9.0 * freedom);
-        2.0 * (1.0 - a + z * a.sqrt()).powi(3)
-    };
-    [bound(-BAND_DEVIATIONS), bound(BAND_DEVIATIONS)]
 }
 
 fn legend(series: &[Series]) -> Vec<LegendItem> {
@@ -194,7 +187,7 @@ fn table_panel(all: &[Series]) -> Panel {
         let y = top + ROW_PX * (i as f64 + 1.0) + 8.0;
         let mut levels: Vec<f64> = series.answers.iter().map(|a| a.credible_level).collect();
         levels.sort_unstable_by(f64::total_cmp);
-        let mean = series.answers.iter().map(|a| a.nees).sum::<f64>() / levels.len() as f64;
+        let mean = mean_nees(series);
         let [low, high] = nees_bounds(levels.len());
         let percent = |nominal: f64| format!("{:.0} %", 100.0 * coverage(&levels, nominal));
         let cells = [
@@ -228,13 +221,6 @@ fn table_panel(all: &[Series]) -> Panel {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn bounds_of_the_mean_nees_are_those_of_chi_square() {
-        // Quantiles of χ²(200) at 2.5 and 97.5 %: 162.728, 241.058 (scipy.stats.chi2.ppf).
-        let [low, high] = nees_bounds(100);
-        assert!((low - 1.627_28).abs() < 2e-3 && (high - 2.410_58).abs() < 2e-3, "{low} {high}");
-    }
 
     #[test]
     fn coverage_counts_what_lies_inside() {
