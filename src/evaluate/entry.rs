@@ -286,8 +286,8 @@ says a position.
 Without a recipe: nearest, the learning image with the most similar z-scored properties; aligned, by circular correlation
 of small panoramas; bow-nearest, by visual words; median, always the median position. bow is the paper's bag of words:
 labels are test positions, and its errors are of labels (eq. 15), 0 where the label is right, up to 5 m away: they are not
-to be compared with the others. Words and neighbours are chosen on the validation frames, like the paper's features;
-nothing is chosen on the test frames.
+to be compared with the others. Words, and for bow neighbours, are chosen on the validation frames, like the paper's
+features; nothing is chosen on the test frames.
 ";
 
 #[cfg(test)]
