@@ -19,7 +19,7 @@ mod trial;
 mod update;
 
 pub use group::{LearnError, LearnedGroup};
-pub use panoramas::describe_panoramas;
+pub use panoramas::{DescribedRecording, describe_panoramas};
 pub use split::{BLOCKS, Split, SplitError};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};

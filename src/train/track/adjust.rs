@@ -32,18 +32,13 @@ impl Equation {
         self.right - self.terms.iter().map(|&(at, coefficient)| coefficient * unknowns[at]).sum::<f64>()
     }
 
+    /// Expectation step of the t distribution (Lange, Little & Taylor 1989, eq. 3.5): (ν + 1) / (ν + r²/σ²).
     fn weight(&self, unknowns: &[f64]) -> f64 {
         match self.has_outliers {
-            true => weight_of(self.residual(unknowns) / self.variance.sqrt()),
+            true => (FREEDOM + 1.0) / (FREEDOM + self.residual(unknowns).powi(2) / self.variance),
             false => 1.0,
         }
     }
-}
-
-/// What a residual of so many standard deviations counts. Expectation step of the t distribution (Lange, Little & Taylor
-/// 1989, eq. 3.5): (ν + 1) / (ν + r²/σ²).
-pub fn weight_of(deviations: f64) -> f64 {
-    (FREEDOM + 1.0) / (FREEDOM + deviations * deviations)
 }
 
 /// The least-squares solution with weights as given; `None` when the equations do not determine all unknowns.
@@ -78,15 +73,10 @@ pub fn solve_weighted(count: usize, equations: &[Equation], weights: Vec<f64>) -
 pub fn solve(count: usize, equations: &[Equation]) -> Option<Solution> {
     let mut solution = solve_weighted(count, equations, vec![1.0; equations.len()])?;
     for _ in 0..REWEIGHTINGS {
-        solution = solve_about(&solution.unknowns, equations)?;
+        let weights = equations.iter().map(|equation| equation.weight(&solution.unknowns)).collect();
+        solution = solve_weighted(count, equations, weights)?;
     }
     Some(solution)
-}
-
-/// The solution with weights that the residuals at `unknowns` have.
-pub fn solve_about(unknowns: &[f64], equations: &[Equation]) -> Option<Solution> {
-    let weights = equations.iter().map(|equation| equation.weight(unknowns)).collect();
-    solve_weighted(unknowns.len(), equations, weights)
 }
 
 #[cfg(test)]

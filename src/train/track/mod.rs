@@ -2,13 +2,11 @@
 //!
 //! A receiver errs by half a metre or more, but slowly; images tell places apart to a decimetre or two. So the error of the
 //! learning positions is the floor of what a map can do. Here the errors b of all frames are estimated in one batch, robust
-//! least squares over four kinds of equations:
+//! least squares over three kinds of equations:
 //!
 //! - the *receiver's* error is a stationary process about zero ([`motion`]), so that the whole never drifts away from what
 //!   the receivers say on average – and keeps the part of the error that is the same everywhere;
-//! - *points* of the scene, [followed](follow) from frame to frame, are where their [`bearings`] meet: how the frames of a
-//!   stretch lie to each other, to a few centimetres a step;
-//! - where there are no points, the *vehicle* moves where it is headed and changes its speed slowly ([`motion`]);
+//! - the *vehicle* moves where it is headed and changes its speed slowly ([`motion`]);
 //! - a place seen on another *pass* – lap, direction, recording – looks as it did ([`views`]), across recordings too, each
 //!   of which has its own receiver error, its own time and its own noise.
 //!
@@ -16,23 +14,16 @@
 //! photographs at random headings, a lattice – is left as it is.
 //!
 //! What is honest: motion equations use what the receiver said of all frames of a recording, which a survey has whatever
-//! images are learned from; images are compared, and bearings taken, only from the frames that are learned from. Points
-//! are followed through all frames, but what lies between two frames says nothing of a frame's own position.
+//! images are learned from; images are compared only among the frames that are learned from.
 
 mod adjust;
-mod bearings;
-mod follow;
 mod motion;
 mod skyline;
 mod views;
 
 use std::ops::Range;
 
-use adjust::{Equation, Solution};
-pub use bearings::PointTrack;
-use bearings::{Frames, Meetings};
-pub use follow::{PointFollower, Sighting};
-use motion::{Track, TrackPoint, Unknowns};
+use motion::{Track, TrackPoint};
 pub use views::Similarity;
 
 use super::survey::Survey;
@@ -45,14 +36,6 @@ use views::Passes;
 /// How far another pass may lie: in spacings of frames, and in deviations of the receiver on top.
 const REACH_SPACINGS: f64 = 3.0;
 const REACH_DEVIATIONS: f64 = 4.0;
-/// A recording sees points if its frames see so many each, on average, that are where their bearings meet, and if so large a
-/// share of all points is. Then its motion counts for little: the errors of yaw and of slip, which are taken to be others in
-/// every step, are alike over many, and bearings know better.
-const ENOUGH_POINTS: usize = 10;
-const LEAST_MET: f64 = 0.5;
-const MOTION_STDS_BESIDE_BEARINGS: f64 = 10.0;
-/// Equations are weighed, and bearings taken, about the positions so far, so many times.
-const ROUNDS: usize = 6;
 /// The remaining deviation is the mean over so many frames of a recording.
 const REPORTED_FRAMES: usize = 64;
 
@@ -63,8 +46,6 @@ pub struct TrackSmoother {
     recording: Vec<usize>,
     tracks: Vec<RecordingTrack>,
     spacing_m: f64,
-    yaw_rad: Vec<f64>,
-    points: Vec<PointTrack>,
 }
 
 /// One recording: its frames, and the track they are if they are one.
@@ -112,7 +93,7 @@ impl TrackSmoother {
             .map(|(frame, &position_m)| TrackPoint { position_m, yaw_rad: frame.yaw_rad, time_s: frame.time_s })
             .collect();
         let recording: Vec<usize> = survey.frames.iter().map(|frame| frame.recording).collect();
-        Self { points: survey.points().to_vec(), ..Self::of_points(&points, &recording) }
+        Self::of_points(&points, &recording)
     }
 
     /// `recording` rises.
@@ -125,12 +106,29 @@ impl TrackSmoother {
         }
         let positions_m: Vec<PositionM> = points.iter().map(|point| point.position_m).collect();
         let spacing_m = median_neighbour_spacing_m(&positions_m, recording);
-        let yaw_rad = points.iter().map(|point| point.yaw_rad.unwrap_or(0.0)).collect();
-        Self { positions_m, recording: recording.to_vec(), tracks, spacing_m, yaw_rad, points: Vec::new() }
+        Self { positions_m, recording: recording.to_vec(), tracks, spacing_m }
     }
 
     /// The most likely positions when images may be compared among the frames `learned`, in rising order.
     pub fn smoothed(&self, learned: &[usize], similarity: Option<&Similarity>) -> Smoothed {
+        // Unknowns: the tracks one after the other, the errors of their courses last, where they make no row long but
+        // their own.
+        let mut first_unknown = vec![usize::MAX; self.positions_m.len()];
+        let mut count = 0;
+        let found: Vec<(&RecordingTrack, &Track)> =
+            self.tracks.iter().filter_map(|of| Some((of, of.track.as_ref().ok()?))).collect();
+        for (of, _) in &found {
+            for row in of.rows.clone() {
+                first_unknown[row] = count;
+                count += 2;
+            }
+        }
+        let courses = count;
+        count += found.len();
+        let mut equations = Vec::new();
+        for (k, (of, track)) in found.iter().enumerate() {
+            equations.extend(track.equations(first_unknown[of.rows.start], courses + k));
+        }
         let left_alone = |why: NotATrack| Smoothed {
             positions_m: self.positions_m.clone(),
             reports: self
@@ -139,44 +137,39 @@ impl TrackSmoother {
                 .map(|of| TrackReport::LeftAlone(of.track.as_ref().err().copied().unwrap_or(why)))
                 .collect(),
         };
-        let found: Vec<(&RecordingTrack, &Track)> =
-            self.tracks.iter().filter_map(|of| Some((of, of.track.as_ref().ok()?))).collect();
+        let corrected = |unknowns: &[f64]| -> Vec<PositionM> {
+            let of_row = |(position_m, &first): (&PositionM, &usize)| match first {
+                usize::MAX => *position_m,
+                first => [position_m[0] - unknowns[first], position_m[1] - unknowns[first + 1]],
+            };
+            self.positions_m.iter().zip(&first_unknown).map(of_row).collect()
+        };
         if found.is_empty() {
             return left_alone(NotATrack::Undetermined);
         }
-        let layout = Layout::new(&found, self.positions_m.len());
-        // With motion alone first, which shows whether points are where bearings meet.
-        let by_motion = adjust::solve(layout.count, &self.equations(&layout, &found, &[]));
-        let Some(mut solution) = by_motion else { return left_alone(NotATrack::Undetermined) };
-        let seeing = self.seeing(&layout, &found, learned, &solution);
-        let used: Vec<usize> = learned.iter().copied().filter(|&row| seeing.contains(&self.recording[row])).collect();
-        let mut equations = self.equations(&layout, &found, &seeing);
-        let refined = |equations: &[Equation], solution| self.refined(&layout, equations, &used, solution);
-        match refined(&equations, solution) {
-            Some(better) => solution = better,
-            None => return left_alone(NotATrack::Undetermined),
-        }
+        let Some(mut solution) = adjust::solve(count, &equations) else { return left_alone(NotATrack::Undetermined) };
         let mut views = Vec::new();
         if let Some(similarity) = similarity {
-            let rows: Vec<usize> = learned.iter().copied().filter(|&row| layout.first[row].is_some()).collect();
+            let rows: Vec<usize> = learned.iter().copied().filter(|&row| first_unknown[row] != usize::MAX).collect();
             let receiver_std_m = found.iter().map(|(_, track)| track.noise.receiver_std_m).fold(0.0, f64::max);
             let reach_m = REACH_SPACINGS * self.spacing_m + REACH_DEVIATIONS * receiver_std_m;
+            let by_motion_m = corrected(&solution.unknowns);
             let passes = Passes {
-                positions_m: &self.corrected(&layout, &solution.unknowns),
+                positions_m: &by_motion_m,
                 recording: &self.recording,
                 rows: &rows,
                 reach_m,
                 spacing_m: self.spacing_m,
             };
             views = passes.views(similarity);
-            equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
-            match refined(&equations, solution) {
+            equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &first_unknown)));
+            match adjust::solve(count, &equations) {
                 Some(with_views) => solution = with_views,
                 None => return left_alone(NotATrack::Undetermined),
             }
         }
 
-        let positions_m = self.corrected(&layout, &solution.unknowns);
+        let positions_m = corrected(&solution.unknowns);
         let report = |of: &RecordingTrack| match &of.track {
             Err(why) => TrackReport::LeftAlone(*why),
             Ok(track) => {
@@ -185,8 +178,7 @@ impl TrackSmoother {
                     of.rows.clone().map(|row| distance_m(positions_m[row], self.positions_m[row]).powi(2)).sum();
                 let every = of.rows.len().div_ceil(REPORTED_FRAMES);
                 let variances_m2: Vec<f64> = (of.rows.clone().step_by(every))
-                    .filter_map(|row| layout.first[row])
-                    .flat_map(|first| [0, 1].map(|axis| solution.factor.inverse_diagonal(first + axis)))
+                    .flat_map(|row| [0, 1].map(|axis| solution.factor.inverse_diagonal(first_unknown[row] + axis)))
                     .collect();
                 TrackReport::Smoothed {
                     receiver_std_m: track.noise.receiver_std_m,
@@ -198,121 +190,6 @@ impl TrackSmoother {
             }
         };
         Smoothed { reports: self.tracks.iter().map(report).collect(), positions_m }
-    }
-
-    /// What is known without any image; the motion of the recordings `seeing` counts for little.
-    fn equations(&self, layout: &Layout, found: &[(&RecordingTrack, &Track)], seeing: &[usize]) -> Vec<Equation> {
-        let mut equations = layout.priors();
-        for (k, (of, track)) in found.iter().enumerate() {
-            let unknowns = layout.of_track(of, k);
-            let is_seeing = seeing.contains(&self.recording[of.rows.start]);
-            let inflation = if is_seeing { MOTION_STDS_BESIDE_BEARINGS.powi(2) } else { 1.0 };
-            equations.extend(track.receiver_equations(unknowns));
-            let of_vehicle = track.vehicle_equations(unknowns);
-            equations.extend(of_vehicle.into_iter().map(|e| Equation { variance: inflation * e.variance, ..e }));
-        }
-        equations
-    }
-
-    /// The recordings whose frames `learned` see enough points, most of which are where their bearings meet: neither where
-    /// it is dark nor where the camera looks elsewhere than the yaw says.
-    fn seeing(
-        &self,
-        layout: &Layout,
-        found: &[(&RecordingTrack, &Track)],
-        learned: &[usize],
-        by_motion: &Solution,
-    ) -> Vec<usize> {
-        let positions_m = self.corrected(layout, &by_motion.unknowns);
-        let yaw_errors_rad = layout.yaw_errors_rad(&by_motion.unknowns);
-        let frames = self.frames(layout, &positions_m, &yaw_errors_rad);
-        let is_seeing = |of: &RecordingTrack| {
-            let is_used = |row: usize| of.rows.contains(&row) && learned.binary_search(&row).is_ok();
-            let rows = of.rows.clone().filter(|&row| is_used(row)).count();
-            let Meetings { parts, met, sightings } = frames.meetings(&self.points, is_used);
-            rows > 0 && sightings >= ENOUGH_POINTS * rows && met as f64 >= LEAST_MET * parts as f64
-        };
-        found.iter().filter(|(of, _)| is_seeing(of)).map(|(of, _)| self.recording[of.rows.start]).collect()
-    }
-
-    fn frames<'a>(&'a self, layout: &'a Layout, positions_m: &'a [PositionM], yaw_error_rad: &'a [f64]) -> Frames<'a> {
-        Frames {
-            positions_m,
-            received_m: &self.positions_m,
-            yaw_rad: &self.yaw_rad,
-            yaw_error_rad,
-            first_unknown: &layout.first,
-            camera: layout.camera,
-        }
-    }
-
-    /// Weighs `equations`, and takes bearings from the frames `learned`, about the positions so far, [`ROUNDS`] times.
-    fn refined(
-        &self,
-        layout: &Layout,
-        equations: &[Equation],
-        learned: &[usize],
-        mut solution: Solution,
-    ) -> Option<Solution> {
-        let is_used = |row: usize| layout.first[row].is_some() && learned.binary_search(&row).is_ok();
-        for _ in 0..ROUNDS {
-            let positions_m = self.corrected(layout, &solution.unknowns);
-            let yaw_errors_rad = layout.yaw_errors_rad(&solution.unknowns);
-            let frames = self.frames(layout, &positions_m, &yaw_errors_rad);
-            let bearings = frames.equations(&self.points, is_used);
-            solution = adjust::solve_about(&solution.unknowns, &[equations, &bearings].concat())?;
-        }
-        Some(solution)
-    }
-
-    /// The recorded positions less their errors.
-    fn corrected(&self, layout: &Layout, unknowns: &[f64]) -> Vec<PositionM> {
-        let of_row = |(position_m, first): (&PositionM, &Option<usize>)| match *first {
-            None => *position_m,
-            Some(first) => [position_m[0] - unknowns[first], position_m[1] - unknowns[first + 1]],
-        };
-        self.positions_m.iter().zip(&layout.first).map(of_row).collect()
-    }
-}
-
-/// Where the unknowns are: the tracks one after the other, east error, north error and yaw's error of each frame; the errors
-/// of the courses and of the camera last, where they make no row long but their own.
-struct Layout {
-    /// Of every row of the survey; `None` where it is of no track.
-    first: Vec<Option<usize>>,
-    courses: usize,
-    camera: usize,
-    count: usize,
-}
-
-const UNKNOWNS_A_FRAME: usize = 3;
-
-impl Layout {
-    fn new(found: &[(&RecordingTrack, &Track)], rows: usize) -> Self {
-        let mut first = vec![None; rows];
-        let mut courses = 0;
-        for row in found.iter().flat_map(|(of, _)| of.rows.clone()) {
-            first[row] = Some(courses);
-            courses += UNKNOWNS_A_FRAME;
-        }
-        let camera = courses + found.len();
-        Self { first, courses, camera, count: camera + 1 }
-    }
-
-    /// Those of the track number `k`.
-    fn of_track(&self, of: &RecordingTrack, k: usize) -> Unknowns {
-        let first = self.first[of.rows.start].expect("a track's rows have unknowns");
-        Unknowns { first, a_frame: UNKNOWNS_A_FRAME, course: self.courses + k }
-    }
-
-    fn priors(&self) -> Vec<Equation> {
-        let yaws = self.first.iter().flatten().map(|first| bearings::yaw_prior(first + 2));
-        yaws.chain([bearings::camera_prior(self.camera)]).collect()
-    }
-
-    /// Of every row.
-    fn yaw_errors_rad(&self, unknowns: &[f64]) -> Vec<f64> {
-        self.first.iter().map(|first| first.map_or(0.0, |first| unknowns[first + 2] + unknowns[self.camera])).collect()
     }
 }
 

@@ -27,21 +27,6 @@ pub struct Track {
     pub noise: TrackNoise,
 }
 
-/// Where the unknowns of a track are: `first` + `a_frame` i is the east error of frame i, the one after it the north
-/// error, and `course` that of the course.
-#[derive(Debug, Clone, Copy)]
-pub struct Unknowns {
-    pub first: usize,
-    pub a_frame: usize,
-    pub course: usize,
-}
-
-impl Unknowns {
-    fn error(&self, frame: usize, axis: usize) -> usize {
-        self.first + self.a_frame * frame + axis
-    }
-}
-
 /// How wrong receiver and motion model are.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackNoise {
@@ -98,47 +83,40 @@ impl Track {
         Ok(track)
     }
 
-    /// What receiver and vehicle say.
-    fn equations(&self, unknowns: Unknowns) -> Vec<Equation> {
-        [self.receiver_equations(unknowns), self.vehicle_equations(unknowns)].concat()
+    /// Number of unknowns: east and north error of each frame, and the error of the course.
+    pub fn unknowns(&self) -> usize {
+        2 * self.positions_m.len() + 1
     }
 
-    /// The receiver's error changes slowly about zero:
+    /// Equations of this track alone. Frame i has the unknowns `first` + 2 i and + 2 i + 1, the course has `course`.
     ///
     /// ```text
     /// b_0 = 0 ± σ                 b_(i+1) − φ b_i = 0 ± σ √(1 − φ²)          φ = exp(−Δt / τ)
-    /// ```
-    pub fn receiver_equations(&self, unknowns: Unknowns) -> Vec<Equation> {
-        let variance = self.noise.receiver_std_m.powi(2);
-        let b = |frame: usize, axis: usize| unknowns.error(frame, axis);
-        let mut equations: Vec<Equation> = [0, 1].map(|axis| prior(b(0, axis), variance)).into();
-        for i in 0..self.positions_m.len() - 1 {
-            let kept = (-self.step_s(i) / self.noise.receiver_time_s).exp();
-            equations.extend([0, 1].map(|axis| Equation {
-                terms: vec![(b(i + 1, axis), 1.0), (b(i, axis), -kept)],
-                right: 0.0,
-                variance: variance * (1.0 - kept * kept),
-                has_outliers: true,
-            }));
-        }
-        equations
-    }
-
-    /// The vehicle moves where it is headed, and changes its speed slowly:
-    ///
-    /// ```text
     /// n·(b_(i+1) − b_i) + d δ = n·(z_(i+1) − z_i) ± σ_slip          n ⟂ u, the mean course of the step of length d
     /// u·Δp / Δt − u'·Δp' / Δt' = 0 ± σ_a √Δt                        of one step and the one before
     /// δ = 0 ± 0.03 rad
     /// ```
-    pub fn vehicle_equations(&self, unknowns: Unknowns) -> Vec<Equation> {
-        let (z, noise, course) = (&self.positions_m, &self.noise, unknowns.course);
-        let b = |frame: usize, axis: usize| unknowns.error(frame, axis);
+    pub fn equations(&self, first: usize, course: usize) -> Vec<Equation> {
+        let (z, noise) = (&self.positions_m, &self.noise);
+        let receiver_variance = noise.receiver_std_m.powi(2);
+        let b = |frame: usize, axis: usize| first + 2 * frame + axis;
+        let prior =
+            |at: usize, variance: f64| Equation { terms: vec![(at, 1.0)], right: 0.0, variance, has_outliers: false };
         let mut equations = vec![prior(course, YAW_OFFSET_STD_RAD.powi(2))];
+        equations.extend([0, 1].map(|axis| prior(b(0, axis), receiver_variance)));
         // Of the step before: direction, way, first frame, duration.
         let mut before: Option<([f64; 2], f64, usize, f64)> = None;
         for i in 0..z.len() - 1 {
-            let step_s = self.step_s(i);
+            let step_s = (self.time_s[i + 1] - self.time_s[i]).max(MIN_STEP_S);
+            let kept = (-step_s / noise.receiver_time_s).exp();
+            for axis in 0..2 {
+                equations.push(Equation {
+                    terms: vec![(b(i + 1, axis), 1.0), (b(i, axis), -kept)],
+                    right: 0.0,
+                    variance: receiver_variance * (1.0 - kept * kept),
+                    has_outliers: true,
+                });
+            }
             if step_s > MAX_STEP_S {
                 before = None;
                 continue;
@@ -183,16 +161,6 @@ impl Track {
         equations
     }
 
-    /// From frame `i` to the next.
-    fn step_s(&self, i: usize) -> f64 {
-        (self.time_s[i + 1] - self.time_s[i]).max(MIN_STEP_S)
-    }
-
-    /// Nothing but this track.
-    fn alone(&self) -> Unknowns {
-        Unknowns { first: 0, a_frame: 2, course: 2 * self.positions_m.len() }
-    }
-
     /// The noise that makes this track most likely, positions and course integrated out; `None` when no noise makes it
     /// likely at all.
     ///
@@ -201,11 +169,10 @@ impl Track {
     /// they have as such, so that one jump of the receiver does not make it a bad one.
     fn most_likely_noise(&self) -> Option<TrackNoise> {
         let mut track = self.clone();
-        let alone = self.alone();
-        let mut inflations = vec![1.0; track.equations(alone).len()];
+        let mut inflations = vec![1.0; track.equations(0, self.unknowns() - 1).len()];
         for _ in 0..OUTLIER_ROUNDS {
             track.search(&inflations)?;
-            let solution = solve(alone.course + 1, &track.equations(alone))?;
+            let solution = solve(self.unknowns(), &track.equations(0, self.unknowns() - 1))?;
             let of_outliers = |&weight: &f64| if weight < OUTLIER_WEIGHT { 1.0 / weight.max(1e-9) } else { 1.0 };
             inflations = solution.weights.iter().map(of_outliers).collect();
         }
@@ -240,10 +207,9 @@ impl Track {
 
     /// −2 log of the likelihood and of a weak prior on the noise, but for a constant.
     fn misfit(&self, inflations: &[f64]) -> Option<f64> {
-        let alone = self.alone();
-        let equations = self.equations(alone);
+        let equations = self.equations(0, self.unknowns() - 1);
         let weights = inflations.iter().map(|inflation| 1.0 / inflation).collect();
-        let solution = solve_weighted(alone.course + 1, &equations, weights)?;
+        let solution = solve_weighted(self.unknowns(), &equations, weights)?;
         let log_variances: f64 = equations.iter().map(|equation| equation.variance.ln()).sum();
         let (noise, usual) = (&self.noise, &START);
         let unusual = (noise.receiver_std_m / usual.receiver_std_m).ln().powi(2) / USUAL_LOG_STD_OF_STD.powi(2)
@@ -273,10 +239,6 @@ impl TrackNoise {
             _ => (&mut self.yaw_std_rad, [0.003, 0.1]),
         }
     }
-}
-
-fn prior(at: usize, variance: f64) -> Equation {
-    Equation { terms: vec![(at, 1.0)], right: 0.0, variance, has_outliers: false }
 }
 
 fn step(from: PositionM, to: PositionM) -> [f64; 2] {

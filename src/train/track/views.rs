@@ -207,13 +207,13 @@ const MIN_STEP_SPACINGS: f64 = 0.2;
 impl View {
     /// a·(p_frame − p_between) = 0 along the pass, in terms of the errors b = z − p; frame i has the unknowns
     /// `first_unknown[i]` and the one after it.
-    pub fn equation(&self, positions_m: &[PositionM], first_unknown: &[Option<usize>]) -> Equation {
+    pub fn equation(&self, positions_m: &[PositionM], first_unknown: &[usize]) -> Equation {
         let [before, after] = self.between;
         let mut equation =
             Equation { terms: Vec::with_capacity(6), right: 0.0, variance: self.std_m.powi(2), has_outliers: true };
         for (frame, factor) in [(self.frame, 1.0), (before, self.share - 1.0), (after, -self.share)] {
             for (axis, (along, received_m)) in self.along.iter().zip(positions_m[frame]).enumerate() {
-                equation.terms.extend(first_unknown[frame].map(|first| (first + axis, factor * along)));
+                equation.terms.push((first_unknown[frame] + axis, factor * along));
                 equation.right += factor * along * received_m;
             }
         }
