@@ -300,6 +300,7 @@ fn what_cannot_work_is_refused_with_what_can() {
     let table = [
         ("", "", Some("2"), "not present", "is not there"),
         ("", "", Some("13"), "not permitted", "usermod -aG video"),
+        ("", "", Some("1"), "not permitted", "DeviceAllow="),
         ("", "", Some("16"), "busy", "another program"),
         ("metadata_node", "", None, "unsupported", "-video-index0"),
         ("no_streaming", "", None, "unsupported", "streaming"),

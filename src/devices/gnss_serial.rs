@@ -25,7 +25,7 @@ use rustix::{
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use serialport::{SerialPort, TTYPort};
 
-use super::{DeviceError, SerialChunk, SerialEvent, Stop, rate_hunt::RateHunt};
+use super::{DeviceError, SerialChunk, SerialEvent, Stop, rate_hunt::RateHunt, refused_by_sandbox};
 use crate::types::{Clock, NS_PER_S};
 
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
@@ -276,8 +276,8 @@ fn open_error(path: &Path, device: String, error: serialport::Error) -> DeviceEr
         // Unplugged between a look at the path and its opening.
         _ if !path.exists() => DeviceError::NotPresent { device },
         _ => match is_terminal(path) {
-            // So refuses a sandbox; serialport has no word for it.
-            Err(Errno::PERM) => not_permitted(path, device),
+            // serialport has no word for it.
+            Err(Errno::PERM) => refused_by_sandbox(device),
             Ok(true) => DeviceError::Io { device, source: io::Error::other(error.description) },
             Ok(false) | Err(_) => DeviceError::Unsupported { device, what: "it is no serial port".to_owned() },
         },

@@ -138,6 +138,15 @@ impl DeviceError {
     }
 }
 
+/// The rights of a file are not it: those deny with another error (EACCES) than a sandbox does (EPERM).
+pub(crate) fn refused_by_sandbox(device: String) -> DeviceError {
+    let hint = format!(
+        "the sandbox that this runs in refuses it; for a service `sudo systemctl edit` it, with [Service] and \
+         DeviceAllow={device} rw"
+    );
+    DeviceError::NotPermitted { device, hint }
+}
+
 /// Waits for a stamp; `true` if told to stop before.
 pub fn wait_until(stamp_ns: u64, clock: &dyn Clock, stop: &Stop) -> bool {
     loop {

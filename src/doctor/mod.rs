@@ -193,7 +193,7 @@ fn look_at<Event: Send + 'static>(
 }
 
 /// What to do about a device that fails. `list`: a folder with the names of those that are there.
-fn advice(error: &DeviceError, key: &str, list: &Path, group: &str) -> String {
+fn advice(error: &DeviceError, key: &str, list: &Path) -> String {
     match error {
         DeviceError::NotPresent { .. } => match names_in(list).as_slice() {
             [] => format!("plug it in; none of its kind is there ({} is empty)", list.display()),
@@ -203,7 +203,7 @@ fn advice(error: &DeviceError, key: &str, list: &Path, group: &str) -> String {
             "stop the program that uses it: systemctl stop omniloc-record omniloc-localize, or see `fuser -v` on it"
                 .into()
         }
-        DeviceError::NotPermitted { hint, .. } => format!("{hint}: sudo usermod -aG {group} $USER, and log in again"),
+        DeviceError::NotPermitted { hint, .. } => hint.clone(),
         DeviceError::TimedOut { .. } => "check cable and power; plug it out and in again".into(),
         DeviceError::Disconnected { .. } => {
             "check plug, cable and power supply: it vanished while it was looked at".into()

@@ -92,7 +92,7 @@ pub fn findings(look: &Look, port: Option<&Path>) -> Vec<Finding> {
     let mut findings = Vec::new();
     if let Some(error) = &look.error {
         let list = Path::new("/dev/serial/by-id");
-        findings.push(Finding::problem("receiver", error.to_string(), advice(error, "port", list, "dialout")));
+        findings.push(Finding::problem("receiver", error.to_string(), advice(error, "port", list)));
     }
     let Some((opened, baud)) = &look.opened else {
         if findings.is_empty() {

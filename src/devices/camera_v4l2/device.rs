@@ -23,6 +23,7 @@ use super::{
     super::{
         CameraEvent, CameraFacts, DeviceError, Stop,
         mjpeg::MjpegMender,
+        refused_by_sandbox,
         yuyv::{YuyvEncoder, YuyvFormat},
     },
     PixelFormat, Settings,
@@ -159,7 +160,8 @@ impl Device {
                 Some(Errno::NOENT | Errno::NODEV | Errno::NXIO | Errno::NOTDIR) => {
                     DeviceError::NotPresent { device: path }
                 }
-                Some(Errno::ACCESS | Errno::PERM) => DeviceError::NotPermitted {
+                Some(Errno::PERM) => refused_by_sandbox(path),
+                Some(Errno::ACCESS) => DeviceError::NotPermitted {
                     device: path,
                     hint: "add the user to the group video, `sudo usermod -aG video USER`, and log in again".into(),
                 },

@@ -14,6 +14,7 @@
 //! |---|---|---|
 //! | no such device | | `NotPresent`: not present |
 //! | no permission | | `NotPermitted`, names the group: not permitted |
+//! | refused by a sandbox (EPERM) | | `NotPermitted`, names DeviceAllow: not permitted |
 //! | another program has it (S_FMT, REQBUFS, STREAMON say EBUSY) | | `Busy`: busy |
 //! | no camera, or without streaming, the format, the size | | `Unsupported`, names what there is: unsupported |
 //! | not enough USB bandwidth (ENOSPC) | | `Unsupported`: unsupported |
