@@ -24,6 +24,11 @@ use omniloc::{
     types::{Clock, SystemClock},
     world::{Day, Renderer},
 };
+use rustix::{
+    fs::{Mode, OFlags},
+    io::ioctl_fionread,
+    termios::{QueueSelector, tcflush},
+};
 
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = env::args().skip(1).collect();
@@ -34,8 +39,11 @@ fn main() -> anyhow::Result<()> {
     }
 }
 
-/// Sends what the Arduino would, for a day at most. Bytes that nobody reads are lost, as on a line.
+/// Sends what the Arduino would, for a day at most. Bytes that nobody reads are lost, as on a line: a pseudo-terminal that the
+/// emulator holds open while nothing is plugged in would keep them, and begin with where the vehicle was long ago.
 fn receiver() -> anyhow::Result<()> {
+    /// What an adapter holds, generously \[bytes]: two tenths of a second of what is sent.
+    const HELD_BYTES: u64 = 2048;
     let settings: Settings = toml::from_str("place = 'town'\nduration_s = 86400.0")?;
     let pty = Pty::open(None)?;
     println!("{}", pty.path().display());
@@ -43,7 +51,13 @@ fn receiver() -> anyhow::Result<()> {
     let world = settings.world();
     let now = SystemClock.read();
     let simulation = Simulation::new(&settings, &world, now.monotonic_ns, now.realtime_ns);
-    pty.play(simulation.receiver(&world), Pace::Clock, &SystemClock, &Stop::default())?;
+    let line = rustix::fs::open(pty.path(), OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
+    let bytes = simulation.receiver(&world).inspect(|_| {
+        if ioctl_fionread(&line).is_ok_and(|unread_bytes| unread_bytes > HELD_BYTES) {
+            tcflush(&line, QueueSelector::IFlush).expect("a terminal's unread bytes can be dropped");
+        }
+    });
+    pty.play(bytes, Pace::Clock, &SystemClock, &Stop::default())?;
     Ok(())
 }
 
