@@ -36,7 +36,7 @@ def symbols(program):
         if kind in "tTwW" and not name.startswith("$"):
             found.append((int(address, 16), name))
     if not found:
-        sys.exit(f"{program} has no symbols: build it with --release, not with --profile dist")
+        sys.exit(f"{program} has no symbols: build it as benches/instructions/run does")
     return sorted(found)
 
 
