@@ -55,6 +55,10 @@ ready_libclang() {
 # Where large things that are the same for every run are kept.
 omniloc_cache() { echo "${OMNILOC_CACHE:-${XDG_CACHE_HOME:-$HOME/.cache}/omniloc}"; }
 
+# In the project's folder: cargo's target folder for the programs of the Pi. Cargo does not see when what builds C code has
+# changed: that is in the name.
+cross_target() { echo "$(omniloc_cache)/cross-$(cat cross/* | sha256sum | cut -c 1-16)"; }
+
 # QEMU's ARM machines and its disk images. Debian 12's own QEMU is older than its qemu-utils may be: both come from the
 # backports, which apt is told of for this one installation.
 ready_qemu_machine() {
