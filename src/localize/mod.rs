@@ -7,8 +7,9 @@
 //!
 //! [`Localizer`] takes frames all the way; [`Tracker`] is the part from the log-likelihood on, which also serves drives
 //! that are evaluated offline, where [`smooth`] adds what later frames say of earlier ones. The likelihood is in
-//! `likelihood`, maps that are larger than memory in `large`, the discrete Bayes filter in `belief` and `tracker`, the motion between frames in `motion`, what
-//! a frame is worth beside those before it in `news`, and when a position may be said in `state`.
+//! `likelihood`, maps that are larger than memory in `large`, the discrete Bayes filter in `belief` and `tracker`, where in
+//! its hill of the belief the vehicle is in `kalman`, the motion between frames in `motion`, what a frame is worth beside
+//! those before it in `news`, and when a position may be said in `state`.
 
 // The same estimates on every computer.
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))]
