@@ -35,6 +35,9 @@ fn folder() -> TempDir {
     TempDir::new().expect("a temporary folder")
 }
 
+/// An evaluation of one recipe with one type of features, on one split.
+const QUICK: [&str; 6] = ["--features", "gradient", "--recipe", "default", "--split", "random"];
+
 #[test]
 fn a_map_is_trained_shown_checked_and_measured_against() {
     let folder = folder();
@@ -162,18 +165,8 @@ fn it_is_said_how_far_smoothing_moved_the_positions() {
     let (code, stdout, stderr) = run(omniloc()
         .arg("evaluate")
         .arg(&recording)
-        .args([
-            "--features",
-            "gradient",
-            "--recipe",
-            "default",
-            "--seeds",
-            "2",
-            "--split",
-            "random",
-            "--grid-step-m",
-            "5",
-        ])
+        .args(QUICK)
+        .args(["--seeds", "2", "--grid-step-m", "5"])
         .args(["--variants", "plain", "--baselines", "none", "--json"])
         .arg(&results));
     assert_eq!(code, 0, "{stderr}");
@@ -388,18 +381,8 @@ fn a_truth_of_another_place_is_warned_about() {
         let (code, _, stderr) = run(omniloc()
             .arg("evaluate")
             .arg(&recording)
-            .args([
-                "--features",
-                "gradient",
-                "--recipe",
-                "default",
-                "--seeds",
-                "1",
-                "--split",
-                "random",
-                "--grid-step-m",
-                "10",
-            ])
+            .args(QUICK)
+            .args(["--seeds", "1", "--grid-step-m", "10"])
             .args(["--variants", "plain", "--baselines", "none", "--force", "--truth"])
             .arg(&truth)
             .arg("--json")

@@ -16,7 +16,7 @@ use crate::evaluate::{Evaluation, MapComparison, PositionShift, Statistics, map_
 use crate::map::{FeatureMap, file};
 use crate::recording::Recording;
 use crate::train::Survey;
-use crate::types::{PositionM, counted, distance_m};
+use crate::types::{PositionM, counted};
 
 /// Every frame of `recording` against a map.
 pub fn on_map(
@@ -83,11 +83,7 @@ pub fn on_map(
 
 /// Said where most of the positions lie outside all cells: nothing there can be found.
 fn off_the_map(name: &str, path: &Path, map: &FeatureMap, truth_m: &[PositionM]) -> Option<String> {
-    let centers_m = map.cells.centers_m();
-    let is_near = |position_m: &PositionM| {
-        centers_m.iter().any(|&center_m| distance_m(center_m, *position_m) <= map.cells.grid.step_m)
-    };
-    let off = truth_m.iter().filter(|position_m| !is_near(position_m)).count();
+    let off = truth_m.iter().filter(|&&position_m| map.cells.near(position_m, 1).next().is_none()).count();
     (2 * off > truth_m.len()).then(|| {
         format!(
             "{off} of the {} positions of {name} lie outside the cells of {}: no frame can be found there; is it a map of this \

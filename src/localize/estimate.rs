@@ -39,11 +39,7 @@ pub fn refined_m(cells: &CandidateCells, log_likelihood: &[f32], best: usize) ->
 /// The [refined](refined_m) best cell among those at most [`SUMMIT_STEPS`] from `position_m`; `None` where none of them is
 /// a candidate.
 pub fn summit_near(cells: &CandidateCells, log_likelihood: &[f32], position_m: PositionM) -> Option<PositionM> {
-    let [column, row] = [0, 1].map(|axis| ((position_m[axis] - cells.grid.origin_m[axis]) / cells.grid.step_m).round());
-    let around = |middle: f64| {
-        (-SUMMIT_STEPS..=SUMMIT_STEPS).filter_map(move |step| u32::try_from(middle as i64 + i64::from(step)).ok())
-    };
-    let near = around(row).flat_map(|j| around(column).filter_map(move |i| cells.index_of([i, j])));
+    let near = cells.near(position_m, SUMMIT_STEPS);
     let best = near.max_by(|&a, &b| log_likelihood[a].total_cmp(&log_likelihood[b]))?;
     Some(refined_m(cells, log_likelihood, best))
 }
@@ -67,6 +63,8 @@ mod tests {
         let best = most_likely_cell(&log_likelihood);
         assert_eq!(cells.center_m(best), [2.0, 1.5]);
         let refined_m = refined_m(&cells, &log_likelihood, best);
+        assert_eq!(summit_near(&cells, &log_likelihood, [3.0, 1.0]), Some(refined_m), "two cells off");
+        assert_eq!(summit_near(&cells, &log_likelihood, [1e30, -1e30]), None, "no cell is near");
         assert!(
             (refined_m[0] - summit_m[0]).abs() < 1e-5 && (refined_m[1] - summit_m[1]).abs() < 1e-5,
             "{refined_m:?}"

@@ -50,9 +50,7 @@ pub fn smooth(map: &FeatureMap, settings: MotionSettings, frames: &[Observation]
             let hill = backward.belief().product(after);
             backward.take(&reversed);
             let seen = backward.sighting(hill.mean_m, frame.log_likelihood);
-            let PositionCovariance { ee_m2, en_m2, nn_m2 } = seen.covariance;
-            let [ee_m2, en_m2, nn_m2] = [ee_m2, en_m2, nn_m2].map(|variance_m2| FRAMES_ALIKE * variance_m2);
-            Mode { covariance: PositionCovariance { ee_m2, en_m2, nn_m2 }, ..seen }
+            Mode { covariance: seen.covariance.scaled(FRAMES_ALIKE), ..seen }
         })
         .collect();
     sightings.reverse();

@@ -191,9 +191,7 @@ impl Tracker {
         let evidence = Evidence { probability: mode.probability, contradiction, resemblance, share };
         let (state, warnings) = self.states.take(&evidence);
         self.doubt = if warnings.contradiction { DOUBT_IN_CONTRADICTION } else { DOUBT * share };
-        let hill = self.belief.seen_near(mode.mean_m, (1.0 / share) as f32);
-        let seen = Mode { mean_m: self.summit_m(&hill, frame.log_likelihood), ..hill };
-        self.follow(&mode, &seen);
+        self.follow(&mode, frame.log_likelihood);
 
         let single_frame_m = match self.refine {
             true => refined_m(&self.cells, frame.log_likelihood, best),
@@ -211,17 +209,12 @@ impl Tracker {
         &self.belief
     }
 
-    /// What the last frame, with this log-likelihood, says by itself of the place around `position_m`.
+    /// What the last frame, with this log-likelihood, says by itself of the place around `position_m`: the summit of its hill
+    /// there. The flanks, which the temperature raises, are known far less well, and the mean of the hill with them.
     pub(super) fn sighting(&self, position_m: PositionM, log_likelihood: &[f32]) -> Mode {
         let hill = self.belief.seen_near(position_m, (1.0 / self.last_share) as f32);
-        Mode { mean_m: self.summit_m(&hill, log_likelihood), ..hill }
-    }
-
-    /// Where a frame's own hill is highest. Its flanks, which the temperature raises, are known far less well: the mean of
-    /// the hill errs by a fraction of a cell more.
-    fn summit_m(&self, hill: &Mode, log_likelihood: &[f32]) -> PositionM {
         let summit_m = if self.refine { summit_near(&self.cells, log_likelihood, hill.mean_m) } else { None };
-        summit_m.unwrap_or(hill.mean_m)
+        Mode { mean_m: summit_m.unwrap_or(hill.mean_m), ..hill }
     }
 
     /// Moves the belief to the time of a frame, before what that frame says; within `reach`, if pictures show one.
@@ -280,15 +273,15 @@ impl Tracker {
         here.map_or(f64::INFINITY, |here| f64::from(best - here) / self.temperature)
     }
 
-    /// Takes what this frame says of the place: `seen`, in the hill `mode` of the belief.
-    fn follow(&mut self, mode: &Mode, seen: &Mode) {
+    /// Takes what a frame with this log-likelihood says of the place in the hill `mode` of the belief.
+    fn follow(&mut self, mode: &Mode, log_likelihood: &[f32]) {
         if mode.probability < TRACKED {
             self.in_hill = None;
             return self.motion.observe(None);
         }
-        let PositionCovariance { ee_m2, en_m2, nn_m2 } = seen.covariance;
-        let [ee_m2, en_m2, nn_m2] = [ee_m2, en_m2, nn_m2].map(|variance_m2| variance_m2 / self.last_share);
-        let seen = Mode { covariance: PositionCovariance { ee_m2, en_m2, nn_m2 }, ..*seen };
+        let seen = self.sighting(mode.mean_m, log_likelihood);
+        let seen = Mode { covariance: seen.covariance.scaled(1.0 / self.last_share), ..seen };
+        let PositionCovariance { ee_m2, nn_m2, .. } = seen.covariance;
         self.motion.observe(Some(&seen));
         // The belief may have gone over to another hill.
         let reach_m = FITTING_STEPS * self.cells.grid.step_m + FITTING_STDS * ee_m2.max(nn_m2).sqrt();

@@ -136,6 +136,16 @@ impl CandidateCells {
     pub fn index_of(&self, [i, j]: [u32; 2]) -> Option<usize> {
         self.cells.binary_search_by_key(&(j, i), |cell| (cell[1], cell[0])).ok()
     }
+
+    /// The candidates at most `steps` columns and rows from the grid cell nearest to `position_m`.
+    pub fn near(&self, position_m: PositionM, steps: i32) -> impl Iterator<Item = usize> {
+        let [column, row] = [0, 1].map(|axis| (position_m[axis] - self.grid.origin_m[axis]) / self.grid.step_m);
+        let around = move |middle: f64| {
+            let places = (-steps..=steps).map(move |step| middle.round() + f64::from(step));
+            places.filter(|place| (0.0..=f64::from(u32::MAX)).contains(place)).map(|place| place as u32)
+        };
+        around(row).flat_map(move |j| around(column).map(move |i| [i, j])).filter_map(|cell| self.index_of(cell))
+    }
 }
 
 impl Grid {

@@ -35,6 +35,12 @@ pub struct PositionCovariance {
     pub nn_m2: f64,
 }
 
+impl PositionCovariance {
+    pub fn scaled(self, factor: f64) -> Self {
+        Self { ee_m2: factor * self.ee_m2, en_m2: factor * self.en_m2, nn_m2: factor * self.nn_m2 }
+    }
+}
+
 /// What is known after a frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PositionEstimate {
