@@ -148,7 +148,9 @@ fn read(
 ) -> anyhow::Result<Survey> {
     descriptors.sort_unstable();
     descriptors.dedup();
-    let options = SurveyOptions { descriptors, fixed, compass, repetitions: PERTURBED_COPIES, perturbed, seed: 0 };
+    let follow = !fixed && !perturbed.is_empty();
+    let options =
+        SurveyOptions { descriptors, fixed, compass, follow, repetitions: PERTURBED_COPIES, perturbed, seed: 0 };
     let frames = recordings.iter().map(|recording| recording.survey.len()).sum();
     progress.begin(if fixed { "reading frames, turned by their yaw" } else { "reading frames" }, frames);
     Ok(Survey::read(recordings, &options, |frames| progress.advance(frames))?)

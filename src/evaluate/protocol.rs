@@ -115,8 +115,7 @@ impl Protocol<'_> {
                         &frames.indices,
                         smoothed.reports[0],
                     ));
-                    let remaining_std_m = smoothed.remaining_std_m(survey);
-                    (smoothed.positions_m, remaining_std_m)
+                    (smoothed.positions_m, smoothed.remaining_std_m)
                 }
             };
             let trial = Trial {

@@ -19,7 +19,7 @@ mod trial;
 mod update;
 
 pub use group::{LearnError, LearnedGroup};
-pub use panoramas::{DescribedRecording, describe_panoramas};
+pub use panoramas::describe_panoramas;
 pub use split::{BLOCKS, Split, SplitError};
 pub use subset::{Elimination, LikelihoodTable, backward_elimination};
 pub use survey::{Survey, SurveyError, SurveyOptions, SurveyedFrame};
@@ -78,7 +78,7 @@ pub fn train(
     let held_out_m = held_out.as_ref().map_or(&positions_m, |smoothed| &smoothed.positions_m);
     let held_back = Recipe { refit: false, ..recipe.clone() };
     let remaining_std_m =
-        held_out.as_ref().map_or_else(|| vec![0.0; survey.len()], |smoothed| smoothed.remaining_std_m(survey));
+        held_out.as_ref().map_or_else(|| vec![0.0; survey.len()], |smoothed| smoothed.remaining_std_m.clone());
     let trial = Trial {
         recipe: &held_back,
         split: &split,

@@ -7,21 +7,13 @@ use crate::jpeg::LumaDecoder;
 use crate::panorama::{Panorama, UnwrapTable};
 use crate::recording::{Recording, SurveyFrame};
 
-/// What became of a recording's frames.
-pub struct DescribedRecording<V> {
-    pub frames: Vec<SurveyFrame>,
-    /// One a frame.
-    pub described: Vec<V>,
-    /// Width and height of the camera images \[px\].
-    pub image_size_px: (usize, usize),
-}
-
 /// Frames decoded and described at a time: bounds the memory.
 const BATCH: usize = 64;
 
 /// Describes the panoramas of all usable frames of `recording`, in order; `fixed`: each turned by its yaw so that column 0
-/// looks east. `describe` gets a thread's own state and the number of the frame, counted from 0; `on_frames` is told how
-/// many more are done.
+/// looks east. `describe` gets a thread's own state and the number of the frame, counted from 0; `take` gets what it made of
+/// the frames, one after the other; `on_frames` is told how many more are done. Returns width and height of the images \[px\],
+/// if there are any.
 ///
 /// # Errors
 /// Names the recording and the frame.
@@ -30,9 +22,10 @@ pub fn describe_panoramas<S, V: Send>(
     fixed: bool,
     state: impl Fn() -> S + Sync,
     describe: impl Fn(&mut S, usize, &Panorama) -> V + Sync,
+    mut take: impl FnMut(SurveyFrame, V),
     on_frames: impl Fn(usize),
-) -> Result<DescribedRecording<V>, SurveyError> {
-    let mut all = DescribedRecording { frames: Vec::new(), described: Vec::new(), image_size_px: (0, 0) };
+) -> Result<Option<(usize, usize)>, SurveyError> {
+    let mut done = 0;
     let mut batch: Vec<(SurveyFrame, Vec<u8>)> = Vec::with_capacity(BATCH);
     let mut frames = recording.frames()?;
     let mut table = None;
@@ -42,18 +35,17 @@ pub fn describe_panoramas<S, V: Send>(
             batch.push(frame?);
         }
         if batch.is_empty() {
-            return Ok(all);
+            return Ok(table.map(|table: UnwrapTable| table.image_size_px()));
         }
-        let first = all.frames.len();
         let table = match &mut table {
             Some(table) => table,
             none => none.insert(table_of(recording, &batch[0])?),
         };
-        all.image_size_px = table.image_size_px();
-        let describe = |state: &mut S, i: usize, panorama: &Panorama| describe(state, first + i, panorama);
-        all.described.extend(describe_batch(recording, fixed, table, &batch, &state, &describe)?);
-        all.frames.extend(batch.drain(..).map(|(frame, _)| frame));
-        on_frames(all.frames.len() - first);
+        let describe = |state: &mut S, i: usize, panorama: &Panorama| describe(state, done + i, panorama);
+        let described = describe_batch(recording, fixed, table, &batch, &state, &describe)?;
+        done += batch.len();
+        on_frames(batch.len());
+        batch.drain(..).zip(described).for_each(|((frame, _), described)| take(frame, described));
     }
 }
 

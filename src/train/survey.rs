@@ -6,9 +6,10 @@ use faer::Mat;
 
 use super::panoramas::describe_panoramas;
 use super::perturbation::perturbed;
+use super::track::{PointFollower, PointTrack, Sighting};
 use crate::features::{COMPASS_BYTES, Describer, Descriptor};
 use crate::panorama::Panorama;
-use crate::recording::{Recording, RecordingError};
+use crate::recording::{Recording, RecordingError, SurveyFrame};
 use crate::types::{DonutCalibration, Geodetic, PositionM};
 
 /// All usable frames of one or more recordings of a place.
@@ -21,6 +22,7 @@ pub struct Survey {
     pub frames: Vec<SurveyedFrame>,
     /// Frame × [`COMPASS_BYTES`]; empty if not asked for.
     compass: Vec<i8>,
+    points: Vec<PointTrack>,
     properties: BTreeMap<Descriptor, Properties>,
 }
 
@@ -54,6 +56,8 @@ pub struct SurveyOptions {
     pub fixed: bool,
     /// Compass signatures too.
     pub compass: bool,
+    /// Points of the scene are followed from frame to frame, where frames have a yaw.
+    pub follow: bool,
     /// Perturbed copies of every frame, for the descriptors in `perturbed`.
     pub repetitions: usize,
     pub perturbed: Vec<Descriptor>,
@@ -101,6 +105,7 @@ impl Survey {
             image_size_px: (0, 0),
             frames: Vec::new(),
             compass: Vec::new(),
+            points: Vec::new(),
             properties: options.descriptors.iter().map(|&descriptor| (descriptor, Properties::default())).collect(),
         };
         for (number, recording) in recordings.iter().enumerate() {
@@ -141,11 +146,13 @@ impl Survey {
         let describe = |describer: &mut Describer, i: usize, panorama: &Panorama| {
             describe_frame(describer, panorama, options, (first + i) as u64)
         };
-        let of_recording = describe_panoramas(recording, options.fixed, Describer::new, describe, on_frames)?;
-        if !of_recording.frames.is_empty() {
-            self.image_size_px = of_recording.image_size_px;
-        }
-        for (frame, DescribedFrame { properties, compass }) in of_recording.frames.iter().zip(of_recording.described) {
+        let has_yaw = recording.survey.iter().all(|frame| frame.yaw_rad.is_some());
+        let mut follower = (options.follow && has_yaw).then(|| PointFollower::new(self.calibration.azimuth));
+        let mut sightings: Vec<Vec<Sighting>> = Vec::new();
+        let take = |frame: SurveyFrame, DescribedFrame { properties, compass, wide }| {
+            if let (Some(follower), Some(yaw_rad)) = (&mut follower, frame.yaw_rad) {
+                sightings.push(follower.take(&wide, yaw_rad));
+            }
             self.compass.extend(compass);
             self.frames.push(SurveyedFrame {
                 recording: number,
@@ -160,7 +167,10 @@ impl Survey {
                 of_descriptor.clean.extend(clean);
                 of_descriptor.changes.extend(changes);
             }
-        }
+        };
+        let image_size_px = describe_panoramas(recording, options.fixed, Describer::new, describe, take, on_frames)?;
+        self.image_size_px = image_size_px.unwrap_or(self.image_size_px);
+        self.points.extend(PointTrack::gather(first, &sightings));
         Ok(())
     }
 
@@ -185,6 +195,11 @@ impl Survey {
     /// Compass signatures of all frames, frame × [`COMPASS_BYTES`]; empty if they were not asked for.
     pub fn compass(&self) -> &[i8] {
         &self.compass
+    }
+
+    /// Points of the scene that were followed.
+    pub fn points(&self) -> &[PointTrack] {
+        &self.points
     }
 
     /// What the frames are described by.
@@ -216,6 +231,7 @@ struct DescribedFrame {
     /// Properties and how they change under perturbations, a pair a descriptor.
     properties: Vec<(Vec<f32>, Vec<f32>)>,
     compass: Vec<i8>,
+    wide: Vec<f32>,
 }
 
 fn describe_frame(
@@ -241,5 +257,6 @@ fn describe_frame(
             changes[at].extend(there.iter().zip(&clean[at]).map(|(there, here)| there - here));
         }
     }
-    DescribedFrame { properties: clean.into_iter().zip(changes).collect(), compass }
+    let wide = if options.follow { panorama.wide.clone() } else { Vec::new() };
+    DescribedFrame { properties: clean.into_iter().zip(changes).collect(), compass, wide }
 }

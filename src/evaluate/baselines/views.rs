@@ -107,7 +107,8 @@ impl Views {
         let mut views = Vec::new();
         for recording in recordings {
             let describe = |describer: &mut Describer, _, panorama: &Panorama| view(describer, panorama);
-            views.extend(describe_panoramas(recording, fixed, Describer::new, describe, &on_frames)?.described);
+            let take = |_, view| views.push(view);
+            describe_panoramas(recording, fixed, Describer::new, describe, take, &on_frames)?;
         }
         let words = |d: usize, of: fn(&View) -> &Vec<f32>| {
             let mut local = LocalDescriptors::new(d);

@@ -2,11 +2,13 @@
 //!
 //! A receiver errs by half a metre or more, but slowly; images tell places apart to a decimetre or two. So the error of the
 //! learning positions is the floor of what a map can do. Here the errors b of all frames are estimated in one batch, robust
-//! least squares over three kinds of equations:
+//! least squares over four kinds of equations:
 //!
 //! - the *receiver's* error is a stationary process about zero ([`motion`]), so that the whole never drifts away from what
 //!   the receivers say on average – and keeps the part of the error that is the same everywhere;
-//! - the *vehicle* moves where it is headed and changes its speed slowly ([`motion`]);
+//! - *points* of the scene, [followed](follow) from frame to frame, are where their [`bearings`] meet: how the frames of a
+//!   stretch lie to each other, to a few centimetres a step;
+//! - where there are no points, the *vehicle* moves where it is headed and changes its speed slowly ([`motion`]);
 //! - a place seen on another *pass* – lap, direction, recording – looks as it did ([`views`]), across recordings too, each
 //!   of which has its own receiver error, its own time and its own noise.
 //!
@@ -14,16 +16,23 @@
 //! photographs at random headings, a lattice – is left as it is.
 //!
 //! What is honest: motion equations use what the receiver said of all frames of a recording, which a survey has whatever
-//! images are learned from; images are compared only among the frames that are learned from.
+//! images are learned from; images are compared, and bearings taken, only from the frames that are learned from. Points
+//! are followed through all frames, but what lies between two frames says nothing of a frame's own position.
 
 mod adjust;
+mod bearings;
+mod follow;
 mod motion;
 mod skyline;
 mod views;
 
 use std::ops::Range;
 
-use motion::{Track, TrackPoint};
+use adjust::{Equation, Solution};
+pub use bearings::PointTrack;
+use bearings::{Frames, Meetings};
+pub use follow::{PointFollower, Sighting};
+use motion::{Track, TrackPoint, Unknowns};
 pub use views::Similarity;
 
 use super::survey::Survey;
@@ -36,7 +45,15 @@ use views::Passes;
 /// How far another pass may lie: in spacings of frames, and in deviations of the receiver on top.
 const REACH_SPACINGS: f64 = 3.0;
 const REACH_DEVIATIONS: f64 = 4.0;
-/// The remaining deviation is the mean over so many frames of a recording.
+/// A recording sees points if its frames see so many each, on average, that are where their bearings meet, and if so large a
+/// share of all points is. Then its speed counts for less: bearings know better how long a step was.
+const ENOUGH_POINTS: usize = 10;
+const LEAST_MET: f64 = 0.5;
+const SPEED_STDS_BESIDE_BEARINGS: f64 = 3.0;
+/// Equations are weighed, and bearings taken, about the positions so far, again and again: loosely at first, when the bearings
+/// of a point meet only roughly, and as they deserve in the end.
+const LOOSENINGS: [f64; 7] = [8.0, 4.0, 2.0, 1.0, 1.0, 1.0, 1.0];
+/// The remaining deviation is the mean over so many frames of a recording, apart for those that were learned from.
 const REPORTED_FRAMES: usize = 64;
 
 /// The tracks of a survey, with all that does not depend on which frames are learned from.
@@ -46,6 +63,8 @@ pub struct TrackSmoother {
     recording: Vec<usize>,
     tracks: Vec<RecordingTrack>,
     spacing_m: f64,
+    yaw_rad: Vec<f64>,
+    points: Vec<PointTrack>,
 }
 
 /// One recording: its frames, and the track they are if they are one.
@@ -60,16 +79,10 @@ struct RecordingTrack {
 pub struct Smoothed {
     /// One a frame of the survey.
     pub positions_m: Vec<PositionM>,
+    /// What these may still be off by on either axis, one a frame; 0 where they were left alone.
+    pub remaining_std_m: Vec<f64>,
     /// One a recording.
     pub reports: Vec<TrackReport>,
-}
-
-impl Smoothed {
-    /// What positions may still be off by, one a frame of `survey`; 0 where they were left alone.
-    pub fn remaining_std_m(&self, survey: &Survey) -> Vec<f64> {
-        let of = |recording: usize| self.reports[recording].remaining_std_m().unwrap_or(0.0);
-        survey.frames.iter().map(|frame| of(frame.recording)).collect()
-    }
 }
 
 impl Similarity {
@@ -93,7 +106,7 @@ impl TrackSmoother {
             .map(|(frame, &position_m)| TrackPoint { position_m, yaw_rad: frame.yaw_rad, time_s: frame.time_s })
             .collect();
         let recording: Vec<usize> = survey.frames.iter().map(|frame| frame.recording).collect();
-        Self::of_points(&points, &recording)
+        Self { points: survey.points().to_vec(), ..Self::of_points(&points, &recording) }
     }
 
     /// `recording` rises.
@@ -106,90 +119,221 @@ impl TrackSmoother {
         }
         let positions_m: Vec<PositionM> = points.iter().map(|point| point.position_m).collect();
         let spacing_m = median_neighbour_spacing_m(&positions_m, recording);
-        Self { positions_m, recording: recording.to_vec(), tracks, spacing_m }
+        let yaw_rad = points.iter().map(|point| point.yaw_rad.unwrap_or(0.0)).collect();
+        Self { positions_m, recording: recording.to_vec(), tracks, spacing_m, yaw_rad, points: Vec::new() }
     }
 
     /// The most likely positions when images may be compared among the frames `learned`, in rising order.
     pub fn smoothed(&self, learned: &[usize], similarity: Option<&Similarity>) -> Smoothed {
-        // Unknowns: the tracks one after the other, the errors of their courses last, where they make no row long but
-        // their own.
-        let mut first_unknown = vec![usize::MAX; self.positions_m.len()];
-        let mut count = 0;
-        let found: Vec<(&RecordingTrack, &Track)> =
-            self.tracks.iter().filter_map(|of| Some((of, of.track.as_ref().ok()?))).collect();
-        for (of, _) in &found {
-            for row in of.rows.clone() {
-                first_unknown[row] = count;
-                count += 2;
-            }
-        }
-        let courses = count;
-        count += found.len();
-        let mut equations = Vec::new();
-        for (k, (of, track)) in found.iter().enumerate() {
-            equations.extend(track.equations(first_unknown[of.rows.start], courses + k));
-        }
         let left_alone = |why: NotATrack| Smoothed {
             positions_m: self.positions_m.clone(),
+            remaining_std_m: vec![0.0; self.positions_m.len()],
             reports: self
                 .tracks
                 .iter()
                 .map(|of| TrackReport::LeftAlone(of.track.as_ref().err().copied().unwrap_or(why)))
                 .collect(),
         };
-        let corrected = |unknowns: &[f64]| -> Vec<PositionM> {
-            let of_row = |(position_m, &first): (&PositionM, &usize)| match first {
-                usize::MAX => *position_m,
-                first => [position_m[0] - unknowns[first], position_m[1] - unknowns[first + 1]],
-            };
-            self.positions_m.iter().zip(&first_unknown).map(of_row).collect()
-        };
+        let found: Vec<(&RecordingTrack, &Track)> =
+            self.tracks.iter().filter_map(|of| Some((of, of.track.as_ref().ok()?))).collect();
         if found.is_empty() {
             return left_alone(NotATrack::Undetermined);
         }
-        let Some(mut solution) = adjust::solve(count, &equations) else { return left_alone(NotATrack::Undetermined) };
+        let layout = Layout::new(&found, self.positions_m.len());
+        // With motion alone first, which shows whether points are where bearings meet.
+        let by_motion = adjust::solve(layout.count, &self.equations(&layout, &found, &[]));
+        let Some(mut solution) = by_motion else { return left_alone(NotATrack::Undetermined) };
+        let seeing = self.seeing(&layout, &found, learned, &solution);
+        let used: Vec<usize> = learned.iter().copied().filter(|&row| seeing.contains(&self.recording[row])).collect();
+        let mut equations = self.equations(&layout, &found, &seeing);
+        let refined = |equations: &[Equation], solution| self.refined(&layout, equations, &used, solution);
+        match refined(&equations, solution) {
+            Some(better) => solution = better,
+            None => return left_alone(NotATrack::Undetermined),
+        }
         let mut views = Vec::new();
         if let Some(similarity) = similarity {
-            let rows: Vec<usize> = learned.iter().copied().filter(|&row| first_unknown[row] != usize::MAX).collect();
+            let rows: Vec<usize> = learned.iter().copied().filter(|&row| layout.first[row].is_some()).collect();
             let receiver_std_m = found.iter().map(|(_, track)| track.noise.receiver_std_m).fold(0.0, f64::max);
             let reach_m = REACH_SPACINGS * self.spacing_m + REACH_DEVIATIONS * receiver_std_m;
-            let by_motion_m = corrected(&solution.unknowns);
             let passes = Passes {
-                positions_m: &by_motion_m,
+                positions_m: &self.corrected(&layout, &solution.unknowns),
                 recording: &self.recording,
                 rows: &rows,
                 reach_m,
                 spacing_m: self.spacing_m,
             };
             views = passes.views(similarity);
-            equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &first_unknown)));
-            match adjust::solve(count, &equations) {
+            equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
+            match refined(&equations, solution) {
                 Some(with_views) => solution = with_views,
                 None => return left_alone(NotATrack::Undetermined),
             }
         }
 
-        let positions_m = corrected(&solution.unknowns);
+        let positions_m = self.corrected(&layout, &solution.unknowns);
+        let mut remaining_std_m = vec![0.0; self.positions_m.len()];
+        for (of, _) in &found {
+            let is_learned = |row: &usize| learned.binary_search(row).is_ok();
+            let (learned, others): (Vec<usize>, Vec<usize>) = of.rows.clone().partition(is_learned);
+            for rows in [learned, others] {
+                let mean_m = layout.mean_std_m(&solution, &rows);
+                rows.into_iter().for_each(|row| remaining_std_m[row] = mean_m);
+            }
+        }
         let report = |of: &RecordingTrack| match &of.track {
             Err(why) => TrackReport::LeftAlone(*why),
             Ok(track) => {
                 let n = of.rows.len() as f64;
                 let moved_m2: f64 =
                     of.rows.clone().map(|row| distance_m(positions_m[row], self.positions_m[row]).powi(2)).sum();
-                let every = of.rows.len().div_ceil(REPORTED_FRAMES);
-                let variances_m2: Vec<f64> = (of.rows.clone().step_by(every))
-                    .flat_map(|row| [0, 1].map(|axis| solution.factor.inverse_diagonal(first_unknown[row] + axis)))
-                    .collect();
+                let variance_m2 = remaining_std_m[of.rows.clone()].iter().map(|std_m| std_m * std_m).sum::<f64>() / n;
                 TrackReport::Smoothed {
                     receiver_std_m: track.noise.receiver_std_m,
                     receiver_time_s: track.noise.receiver_time_s,
                     moved_m: (moved_m2 / n).sqrt(),
-                    remaining_std_m: (variances_m2.iter().sum::<f64>() / variances_m2.len() as f64).sqrt(),
+                    remaining_std_m: variance_m2.sqrt(),
                     views: views.iter().filter(|view| of.rows.contains(&view.frame)).count(),
                 }
             }
         };
-        Smoothed { reports: self.tracks.iter().map(report).collect(), positions_m }
+        Smoothed { reports: self.tracks.iter().map(report).collect(), remaining_std_m, positions_m }
+    }
+
+    /// What is known without any image; the speed of the recordings `seeing` counts for less.
+    fn equations(&self, layout: &Layout, found: &[(&RecordingTrack, &Track)], seeing: &[usize]) -> Vec<Equation> {
+        let mut equations = layout.priors(found);
+        for (k, (of, track)) in found.iter().enumerate() {
+            let unknowns = layout.of_track(of, k);
+            let is_seeing = seeing.contains(&self.recording[of.rows.start]);
+            equations.extend(track.receiver_equations(unknowns));
+            equations
+                .extend(track.vehicle_equations(unknowns, if is_seeing { SPEED_STDS_BESIDE_BEARINGS } else { 1.0 }));
+        }
+        equations
+    }
+
+    /// The recordings whose frames `learned` see enough points, most of which are where their bearings meet: neither where
+    /// it is dark nor where the camera looks elsewhere than the yaw says.
+    fn seeing(
+        &self,
+        layout: &Layout,
+        found: &[(&RecordingTrack, &Track)],
+        learned: &[usize],
+        by_motion: &Solution,
+    ) -> Vec<usize> {
+        let positions_m = self.corrected(layout, &by_motion.unknowns);
+        let yaw_errors_rad = layout.yaw_errors_rad(&by_motion.unknowns);
+        let frames = self.frames(layout, &positions_m, &yaw_errors_rad, LOOSENINGS[1]);
+        let is_seeing = |of: &RecordingTrack| {
+            let is_used = |row: usize| of.rows.contains(&row) && learned.binary_search(&row).is_ok();
+            let rows = of.rows.clone().filter(|&row| is_used(row)).count();
+            let Meetings { parts, met, sightings } = frames.meetings(&self.points, is_used);
+            rows > 0 && sightings >= ENOUGH_POINTS * rows && met as f64 >= LEAST_MET * parts as f64
+        };
+        found.iter().filter(|(of, _)| is_seeing(of)).map(|(of, _)| self.recording[of.rows.start]).collect()
+    }
+
+    fn frames<'a>(
+        &'a self,
+        layout: &'a Layout,
+        positions_m: &'a [PositionM],
+        yaw_error_rad: &'a [f64],
+        loosening: f64,
+    ) -> Frames<'a> {
+        Frames {
+            positions_m,
+            received_m: &self.positions_m,
+            yaw_rad: &self.yaw_rad,
+            yaw_error_rad,
+            first_unknown: &layout.first,
+            camera: layout.camera,
+            loosening,
+        }
+    }
+
+    /// Weighs `equations`, and takes bearings from the frames `learned`, about the positions so far, a round for each of [`LOOSENINGS`].
+    fn refined(
+        &self,
+        layout: &Layout,
+        equations: &[Equation],
+        learned: &[usize],
+        mut solution: Solution,
+    ) -> Option<Solution> {
+        let is_used = |row: usize| layout.first[row].is_some() && learned.binary_search(&row).is_ok();
+        for loosening in LOOSENINGS {
+            let positions_m = self.corrected(layout, &solution.unknowns);
+            let yaw_errors_rad = layout.yaw_errors_rad(&solution.unknowns);
+            let frames = self.frames(layout, &positions_m, &yaw_errors_rad, loosening);
+            let bearings = frames.equations(&self.points, is_used);
+            let equations: Vec<Equation> = equations.iter().map(|e| e.about(&solution.unknowns)).collect();
+            solution = adjust::solve_about(&solution.unknowns, &[equations, bearings].concat())?;
+        }
+        Some(solution)
+    }
+
+    /// The recorded positions less their errors.
+    fn corrected(&self, layout: &Layout, unknowns: &[f64]) -> Vec<PositionM> {
+        let of_row = |(position_m, first): (&PositionM, &Option<usize>)| match *first {
+            None => *position_m,
+            Some(first) => [position_m[0] - unknowns[first], position_m[1] - unknowns[first + 1]],
+        };
+        self.positions_m.iter().zip(&layout.first).map(of_row).collect()
+    }
+}
+
+/// Where the unknowns are: the tracks one after the other, east error, north error and yaw's error of each frame; the errors
+/// of the courses and of the camera last, where they make no row long but their own.
+struct Layout {
+    /// Of every row of the survey; `None` where it is of no track.
+    first: Vec<Option<usize>>,
+    courses: usize,
+    camera: usize,
+    count: usize,
+}
+
+const UNKNOWNS_A_FRAME: usize = 3;
+
+impl Layout {
+    fn new(found: &[(&RecordingTrack, &Track)], rows: usize) -> Self {
+        let mut first = vec![None; rows];
+        let mut courses = 0;
+        for row in found.iter().flat_map(|(of, _)| of.rows.clone()) {
+            first[row] = Some(courses);
+            courses += UNKNOWNS_A_FRAME;
+        }
+        let camera = courses + found.len();
+        Self { first, courses, camera, count: camera + 1 }
+    }
+
+    /// Those of the track number `k`.
+    fn of_track(&self, of: &RecordingTrack, k: usize) -> Unknowns {
+        let first = self.first[of.rows.start].expect("a track's rows have unknowns");
+        Unknowns { first, a_frame: UNKNOWNS_A_FRAME, has_yaw: true, course: self.courses + k }
+    }
+
+    fn priors(&self, found: &[(&RecordingTrack, &Track)]) -> Vec<Equation> {
+        let of_track = |(of, track): &(&RecordingTrack, &Track)| {
+            let std_rad = track.noise.frame_yaw_std_rad();
+            let unknowns = of.rows.clone().filter_map(|row| self.first[row]);
+            unknowns.map(|first| bearings::yaw_prior(first + 2, std_rad)).collect::<Vec<_>>()
+        };
+        found.iter().flat_map(of_track).chain([bearings::camera_prior(self.camera)]).collect()
+    }
+
+    /// Mean deviation of the positions of `rows`, on either axis.
+    fn mean_std_m(&self, solution: &Solution, rows: &[usize]) -> f64 {
+        let every = rows.len().div_ceil(REPORTED_FRAMES).max(1);
+        let variances_m2: Vec<f64> = (rows.iter().step_by(every))
+            .filter_map(|&row| self.first[row])
+            .flat_map(|first| [0, 1].map(|axis| solution.factor.inverse_diagonal(first + axis)))
+            .collect();
+        (variances_m2.iter().sum::<f64>() / variances_m2.len().max(1) as f64).sqrt()
+    }
+
+    /// Of every row.
+    fn yaw_errors_rad(&self, unknowns: &[f64]) -> Vec<f64> {
+        self.first.iter().map(|first| first.map_or(0.0, |first| unknowns[first + 2] + unknowns[self.camera])).collect()
     }
 }
 

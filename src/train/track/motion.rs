@@ -4,7 +4,7 @@
 //! receiver changes slowly; a vehicle moves where it is headed and changes its speed slowly. Neither alone tells error
 //! from motion; together they do, the better the straighter the error is compared with the way.
 
-use super::adjust::{Equation, solve, solve_weighted};
+use super::adjust::{Equation, Linear, solve, solve_weighted};
 use crate::map::NotATrack;
 use crate::types::{PositionM, wrap_angle_rad};
 
@@ -27,6 +27,27 @@ pub struct Track {
     pub noise: TrackNoise,
 }
 
+/// Where the unknowns of a track are: `first` + `a_frame` i is the east error of frame i, the one after it the north
+/// error, and `course` that of the course.
+#[derive(Debug, Clone, Copy)]
+pub struct Unknowns {
+    pub first: usize,
+    pub a_frame: usize,
+    /// Whether a frame's third unknown is the error of its yaw.
+    pub has_yaw: bool,
+    pub course: usize,
+}
+
+impl Unknowns {
+    fn error(&self, frame: usize, axis: usize) -> usize {
+        self.first + self.a_frame * frame + axis
+    }
+
+    fn yaw(&self, frame: usize) -> Option<usize> {
+        self.has_yaw.then(|| self.error(frame, 2))
+    }
+}
+
 /// How wrong receiver and motion model are.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackNoise {
@@ -35,7 +56,7 @@ pub struct TrackNoise {
     pub receiver_time_s: f64,
     /// Change of speed in a second, one standard deviation; grows with the root of the time.
     pub speed_change_std_mps: f64,
-    /// Error of a frame's yaw.
+    /// Error of the yaw of a step.
     pub yaw_std_rad: f64,
 }
 
@@ -83,40 +104,58 @@ impl Track {
         Ok(track)
     }
 
-    /// Number of unknowns: east and north error of each frame, and the error of the course.
-    pub fn unknowns(&self) -> usize {
-        2 * self.positions_m.len() + 1
+    /// What receiver and vehicle say.
+    fn equations(&self, unknowns: Unknowns) -> Vec<Equation> {
+        [self.receiver_equations(unknowns), self.vehicle_equations(unknowns, 1.0)].concat()
     }
 
-    /// Equations of this track alone. Frame i has the unknowns `first` + 2 i and + 2 i + 1, the course has `course`.
+    /// The receiver's error changes slowly about zero:
     ///
     /// ```text
     /// b_0 = 0 ± σ                 b_(i+1) − φ b_i = 0 ± σ √(1 − φ²)          φ = exp(−Δt / τ)
-    /// n·(b_(i+1) − b_i) + d δ = n·(z_(i+1) − z_i) ± σ_slip          n ⟂ u, the mean course of the step of length d
-    /// u·Δp / Δt − u'·Δp' / Δt' = 0 ± σ_a √Δt                        of one step and the one before
+    /// ```
+    pub fn receiver_equations(&self, unknowns: Unknowns) -> Vec<Equation> {
+        let variance = self.noise.receiver_std_m.powi(2);
+        let b = |frame: usize, axis: usize| unknowns.error(frame, axis);
+        let mut equations: Vec<Equation> = [0, 1].map(|axis| prior(b(0, axis), variance)).into();
+        for i in 0..self.positions_m.len() - 1 {
+            let kept = (-self.step_s(i) / self.noise.receiver_time_s).exp();
+            equations.extend([0, 1].map(|axis| Equation {
+                terms: vec![(b(i + 1, axis), 1.0), (b(i, axis), -kept)],
+                right: 0.0,
+                variance: variance * (1.0 - kept * kept),
+                has_outliers: true,
+                length: None,
+            }));
+        }
+        equations
+    }
+
+    /// The vehicle moves where it is headed, and changes its speed slowly:
+    ///
+    /// ```text
+    /// n·(b_(i+1) − b_i) + d (δ − ε_i/2 − ε_(i+1)/2) = n·(z_(i+1) − z_i) ± σ_slip     n ⟂ u, the mean course of the step
+    /// u·Δp / Δt − u'·Δp' / Δt' = 0 ± σ_a √Δt                                         of one step and the one before
     /// δ = 0 ± 0.03 rad
     /// ```
-    pub fn equations(&self, first: usize, course: usize) -> Vec<Equation> {
-        let (z, noise) = (&self.positions_m, &self.noise);
-        let receiver_variance = noise.receiver_std_m.powi(2);
-        let b = |frame: usize, axis: usize| first + 2 * frame + axis;
-        let prior =
-            |at: usize, variance: f64| Equation { terms: vec![(at, 1.0)], right: 0.0, variance, has_outliers: false };
+    ///
+    /// with the length d = u·Δp of the step and, where they are unknowns, the errors ε of the yaws. The speed is off by
+    /// `speed_stds` times what it is of a track by itself.
+    pub fn vehicle_equations(&self, unknowns: Unknowns, speed_stds: f64) -> Vec<Equation> {
+        let (z, noise, course) = (&self.positions_m, &self.noise, unknowns.course);
+        // `by` times what b changes in a `direction` from frame `i` to the next.
+        let change = |i: usize, direction: [f64; 2], by: f64| {
+            let of_axis = |axis: usize| {
+                let coefficient = by * direction[axis];
+                [(unknowns.error(i + 1, axis), coefficient), (unknowns.error(i, axis), -coefficient)]
+            };
+            [of_axis(0), of_axis(1)].concat()
+        };
         let mut equations = vec![prior(course, YAW_OFFSET_STD_RAD.powi(2))];
-        equations.extend([0, 1].map(|axis| prior(b(0, axis), receiver_variance)));
-        // Of the step before: direction, way, first frame, duration.
-        let mut before: Option<([f64; 2], f64, usize, f64)> = None;
+        // Of the step before: direction, length, duration.
+        let mut before: Option<([f64; 2], f64, f64)> = None;
         for i in 0..z.len() - 1 {
-            let step_s = (self.time_s[i + 1] - self.time_s[i]).max(MIN_STEP_S);
-            let kept = (-step_s / noise.receiver_time_s).exp();
-            for axis in 0..2 {
-                equations.push(Equation {
-                    terms: vec![(b(i + 1, axis), 1.0), (b(i, axis), -kept)],
-                    right: 0.0,
-                    variance: receiver_variance * (1.0 - kept * kept),
-                    has_outliers: true,
-                });
-            }
+            let step_s = self.step_s(i);
             if step_s > MAX_STEP_S {
                 before = None;
                 continue;
@@ -126,39 +165,38 @@ impl Track {
             let (u, n) = ([cos, sin], [-sin, cos]);
             let along_m = dot(u, way);
             let turn_rad = wrap_angle_rad(self.course_rad[i + 1] - self.course_rad[i]).abs();
-            equations.push(Equation {
-                terms: vec![
-                    (b(i + 1, 0), n[0]),
-                    (b(i + 1, 1), n[1]),
-                    (b(i, 0), -n[0]),
-                    (b(i, 1), -n[1]),
-                    (course, along_m),
-                ],
-                right: dot(n, way),
-                variance: SLIP_STD_M.powi(2)
-                    + (along_m * noise.yaw_std_rad).powi(2)
-                    + (SLIP_PER_TURN * along_m * turn_rad).powi(2),
-                has_outliers: true,
-            });
-            if let Some((u_before, before_m, j, before_s)) = before {
-                let terms = [
-                    (b(i + 1, 0), u[0] / step_s),
-                    (b(i + 1, 1), u[1] / step_s),
-                    (b(i, 0), -u[0] / step_s - u_before[0] / before_s),
-                    (b(i, 1), -u[1] / step_s - u_before[1] / before_s),
-                    (b(j, 0), u_before[0] / before_s),
-                    (b(j, 1), u_before[1] / before_s),
-                ];
-                equations.push(Equation {
-                    terms: terms.to_vec(),
-                    right: along_m / step_s - before_m / before_s,
-                    variance: noise.speed_change_std_mps.powi(2) * 0.5 * (step_s + before_s),
-                    has_outliers: true,
-                });
+            let mut slip = change(i, n, 1.0);
+            slip.push((course, along_m));
+            let mut variance = SLIP_STD_M.powi(2) + (SLIP_PER_TURN * along_m * turn_rad).powi(2);
+            match unknowns.yaw(i).zip(unknowns.yaw(i + 1)) {
+                Some((here, there)) => slip.extend([here, there].map(|yaw| (yaw, -0.5 * along_m))),
+                None => variance += (along_m * noise.yaw_std_rad).powi(2),
             }
-            before = Some((u, along_m, i, step_s));
+            let length = Linear { terms: change(i, u, -1.0), constant: along_m };
+            let slipped = Linear { terms: slip, constant: -dot(n, way) };
+            equations.push(Equation::share_of(length, slipped, variance));
+            if let Some((u_before, before_m, before_s)) = before {
+                // `by` times the speed and `by_before` times that of the step before.
+                let speeds = |by: f64, by_before: f64| Linear {
+                    terms: [change(i, u, -by / step_s), change(i - 1, u_before, -by_before / before_s)].concat(),
+                    constant: by * along_m / step_s + by_before * before_m / before_s,
+                };
+                let variance = (speed_stds * noise.speed_change_std_mps).powi(2) * 0.5 * (step_s + before_s);
+                equations.push(Equation::share_of(speeds(0.5, 0.5), speeds(1.0, -1.0), variance));
+            }
+            before = Some((u, along_m, step_s));
         }
         equations
+    }
+
+    /// From frame `i` to the next.
+    fn step_s(&self, i: usize) -> f64 {
+        (self.time_s[i + 1] - self.time_s[i]).max(MIN_STEP_S)
+    }
+
+    /// Nothing but this track.
+    fn alone(&self) -> Unknowns {
+        Unknowns { first: 0, a_frame: 2, has_yaw: false, course: 2 * self.positions_m.len() }
     }
 
     /// The noise that makes this track most likely, positions and course integrated out; `None` when no noise makes it
@@ -169,10 +207,11 @@ impl Track {
     /// they have as such, so that one jump of the receiver does not make it a bad one.
     fn most_likely_noise(&self) -> Option<TrackNoise> {
         let mut track = self.clone();
-        let mut inflations = vec![1.0; track.equations(0, self.unknowns() - 1).len()];
+        let alone = self.alone();
+        let mut inflations = vec![1.0; track.equations(alone).len()];
         for _ in 0..OUTLIER_ROUNDS {
             track.search(&inflations)?;
-            let solution = solve(self.unknowns(), &track.equations(0, self.unknowns() - 1))?;
+            let solution = solve(alone.course + 1, &track.equations(alone))?;
             let of_outliers = |&weight: &f64| if weight < OUTLIER_WEIGHT { 1.0 / weight.max(1e-9) } else { 1.0 };
             inflations = solution.weights.iter().map(of_outliers).collect();
         }
@@ -207,9 +246,10 @@ impl Track {
 
     /// −2 log of the likelihood and of a weak prior on the noise, but for a constant.
     fn misfit(&self, inflations: &[f64]) -> Option<f64> {
-        let equations = self.equations(0, self.unknowns() - 1);
+        let alone = self.alone();
+        let equations = self.equations(alone);
         let weights = inflations.iter().map(|inflation| 1.0 / inflation).collect();
-        let solution = solve_weighted(self.unknowns(), &equations, weights)?;
+        let solution = solve_weighted(alone.course + 1, &equations, weights)?;
         let log_variances: f64 = equations.iter().map(|equation| equation.variance.ln()).sum();
         let (noise, usual) = (&self.noise, &START);
         let unusual = (noise.receiver_std_m / usual.receiver_std_m).ln().powi(2) / USUAL_LOG_STD_OF_STD.powi(2)
@@ -230,6 +270,11 @@ const OUTLIER_ROUNDS: usize = 2;
 const OUTLIER_WEIGHT: f64 = 0.2;
 
 impl TrackNoise {
+    /// Error of a frame's yaw, if that of a step is the mean of two.
+    pub fn frame_yaw_std_rad(&self) -> f64 {
+        std::f64::consts::SQRT_2 * self.yaw_std_rad
+    }
+
     /// A parameter, and the range that is searched.
     fn parameter(&mut self, number: usize) -> (&mut f64, [f64; 2]) {
         match number {
@@ -239,6 +284,10 @@ impl TrackNoise {
             _ => (&mut self.yaw_std_rad, [0.003, 0.1]),
         }
     }
+}
+
+fn prior(at: usize, variance: f64) -> Equation {
+    Equation { terms: vec![(at, 1.0)], right: 0.0, variance, has_outliers: false, length: None }
 }
 
 fn step(from: PositionM, to: PositionM) -> [f64; 2] {

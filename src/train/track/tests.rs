@@ -10,15 +10,19 @@ use crate::train::perturbation::standard_normal;
 const RECEIVER_STD_M: f64 = 0.6;
 const RECEIVER_TIME_S: f64 = 20.0;
 
-/// Laps of a block of 60 by 40 m with round corners, 1.5 m/s at 1 Hz: truth and course.
+/// Laps of a block of 60 by 40 m with round corners, about 1.5 m/s at 1 Hz: truth and course.
 fn laps(frames: usize) -> Vec<(PositionM, f64)> {
+    // The speed varies.
+    laps_after((0..frames).map(|i| 1.5 * i as f64 + 2.0 * (0.05 * i as f64).sin()))
+}
+
+/// The same, after so many metres.
+fn laps_after(ways_m: impl Iterator<Item = f64>) -> Vec<(PositionM, f64)> {
     let corner_m = 5.0;
     let sides_m = [60.0, 40.0, 60.0, 40.0];
     let quarter_m = corner_m * std::f64::consts::FRAC_PI_2;
-    (0..frames)
-        .map(|i| {
-            // The speed varies.
-            let mut way_m = 1.5 * i as f64 + 2.0 * (0.05 * i as f64).sin();
+    ways_m
+        .map(|mut way_m| {
             let (mut at, mut course_rad) = ([0.0, 0.0], 0.0_f64);
             for side in (0..4).cycle() {
                 let (sin, cos) = course_rad.sin_cos();
@@ -206,4 +210,56 @@ fn a_recording_that_is_no_track_stays_beside_one_that_is() {
     assert!(matches!(smoothed.reports[..], [TrackReport::Smoothed { .. }, TrackReport::LeftAlone(NotATrack::NoYaw)]));
     assert_eq!(smoothed.positions_m[100..], positions(&points)[100..]);
     assert_ne!(smoothed.positions_m[..100], positions(&points)[..100]);
+}
+
+/// What a camera, `turned_rad` against the yaw, sees of 400 points along the laps.
+fn points(truth: &[(PositionM, f64)], turned_rad: f64) -> Vec<PointTrack> {
+    let mut random = ChaCha8Rng::seed_from_u64(17);
+    let mut normal = || f64::from(standard_normal(&mut random));
+    let scene: Vec<PositionM> = (0..400)
+        .map(|k| {
+            let (near, _) = truth[k * truth.len() / 400];
+            [near[0] + 10.0 * normal(), near[1] + 10.0 * normal()]
+        })
+        .collect();
+    let sightings: Vec<Vec<Sighting>> = truth
+        .iter()
+        .enumerate()
+        .map(|(i, &(at, yaw_rad))| {
+            let near = scene.iter().enumerate().filter(|(_, point)| (2.0..20.0).contains(&distance_m(**point, at)));
+            near.map(|(number, point)| Sighting {
+                // On the next lap nobody knows it again.
+                point: 10 * number + i / 60,
+                azimuth_rad: (point[1] - at[1]).atan2(point[0] - at[0]) - yaw_rad + turned_rad + 0.005 * normal(),
+            })
+            .collect()
+        })
+        .collect();
+    PointTrack::gather(0, &sightings)
+}
+
+#[test]
+fn points_take_off_more_than_motion_and_nothing_where_the_camera_looks_elsewhere() {
+    // In traffic: now fast, now slow.
+    let mut way_m = 0.0;
+    let truth = laps_after((0..300).map(|i| {
+        way_m += 1.5 + (f64::from(i * i % 7) - 3.0) / 3.0;
+        way_m
+    }));
+    let truth_m: Vec<PositionM> = truth.iter().map(|(position_m, _)| *position_m).collect();
+    let everything: Vec<usize> = (0..300).collect();
+    let mut sums = [0.0; 2];
+    for seed in 0..3 {
+        let by_motion = TrackSmoother::of_points(&received(&truth, seed, 0.0), &[0; 300]);
+        let with_points = |turned_rad| {
+            TrackSmoother { points: points(&truth, turned_rad), ..by_motion.clone() }.smoothed(&everything, None)
+        };
+        let without = by_motion.smoothed(&everything, None);
+        assert_eq!(with_points(1.5), without, "its points are nowhere");
+        for (sum, of) in sums.iter_mut().zip([&without, &with_points(0.0)]) {
+            *sum += rmse_about_mean_m(&of.positions_m, &truth_m);
+        }
+    }
+    let [by_motion, by_points] = sums;
+    assert!(by_points < 0.8 * by_motion, "{by_points} of {by_motion}");
 }

@@ -10,7 +10,7 @@
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::{Mat, MatRef, Par, Side};
 
-use super::adjust::Equation;
+use super::adjust::{Equation, Linear};
 use crate::gp::{Hyperparameters, LearningPositions, Posterior};
 use crate::train::axes::{Axes, add_ridge};
 use crate::types::{PositionM, distance_m};
@@ -51,7 +51,7 @@ pub struct View {
     pub share: f64,
     /// Unit vector along the other pass.
     pub along: [f64; 2],
-    pub std_m: f64,
+    std_m: f64,
 }
 
 /// Where frames are and which recording they belong to: what is needed to find passes.
@@ -206,17 +206,21 @@ const MIN_STEP_SPACINGS: f64 = 0.2;
 
 impl View {
     /// a·(p_frame − p_between) = 0 along the pass, in terms of the errors b = z − p; frame i has the unknowns
-    /// `first_unknown[i]` and the one after it.
-    pub fn equation(&self, positions_m: &[PositionM], first_unknown: &[usize]) -> Equation {
-        let [before, after] = self.between;
-        let mut equation =
-            Equation { terms: Vec::with_capacity(6), right: 0.0, variance: self.std_m.powi(2), has_outliers: true };
-        for (frame, factor) in [(self.frame, 1.0), (before, self.share - 1.0), (after, -self.share)] {
-            for (axis, (along, received_m)) in self.along.iter().zip(positions_m[frame]).enumerate() {
-                equation.terms.push((first_unknown[frame] + axis, factor * along));
-                equation.right += factor * along * received_m;
+    /// `first_unknown[i]` and the one after it. Off by a share of what the two frames are apart.
+    pub fn equation(&self, positions_m: &[PositionM], first_unknown: &[Option<usize>]) -> Equation {
+        // Σ factor · a·p
+        let along = |frames: &[(usize, f64)]| {
+            let mut sum = Linear { terms: Vec::with_capacity(2 * frames.len()), constant: 0.0 };
+            for &(frame, factor) in frames {
+                for (axis, (along, received_m)) in self.along.iter().zip(positions_m[frame]).enumerate() {
+                    sum.terms.extend(first_unknown[frame].map(|first| (first + axis, -factor * along)));
+                    sum.constant += factor * along * received_m;
+                }
             }
-        }
-        equation
+            sum
+        };
+        let [before, after] = self.between;
+        let missed = along(&[(self.frame, 1.0), (before, self.share - 1.0), (after, -self.share)]);
+        Equation::share_of(along(&[(before, -1.0), (after, 1.0)]), missed, self.std_m.powi(2))
     }
 }
