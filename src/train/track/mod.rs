@@ -8,7 +8,7 @@
 //!   the receivers say on average – and keeps the part of the error that is the same everywhere;
 //! - *points* of the scene, [followed](follow) from frame to frame, are where their [`bearings`] meet: how the frames of a
 //!   stretch lie to each other, to a few centimetres a step;
-//! - where there are no points, the *vehicle* moves where it is headed and changes its speed slowly ([`motion`]);
+//! - the *vehicle* moves where it is headed and changes its speed slowly ([`motion`]);
 //! - a place seen on another *pass* – lap, direction, recording – looks as it did ([`views`]), across recordings too, each
 //!   of which has its own receiver error, its own time and its own noise.
 //!
@@ -40,7 +40,7 @@ use crate::features::Descriptor;
 use crate::gp::fit::median_neighbour_spacing_m;
 use crate::map::{NotATrack, Recipe, TrackReport};
 use crate::types::{PositionM, distance_m};
-use views::Passes;
+use views::{Passes, View};
 
 /// How far another pass may lie: in spacings of frames, and in deviations of the receiver on top.
 const REACH_SPACINGS: f64 = 3.0;
@@ -125,79 +125,89 @@ impl TrackSmoother {
 
     /// The most likely positions when images may be compared among the frames `learned`, in rising order.
     pub fn smoothed(&self, learned: &[usize], similarity: Option<&Similarity>) -> Smoothed {
-        let left_alone = |why: NotATrack| Smoothed {
-            positions_m: self.positions_m.clone(),
-            remaining_std_m: vec![0.0; self.positions_m.len()],
-            reports: self
-                .tracks
-                .iter()
-                .map(|of| TrackReport::LeftAlone(of.track.as_ref().err().copied().unwrap_or(why)))
-                .collect(),
-        };
         let found: Vec<(&RecordingTrack, &Track)> =
             self.tracks.iter().filter_map(|of| Some((of, of.track.as_ref().ok()?))).collect();
-        if found.is_empty() {
-            return left_alone(NotATrack::Undetermined);
-        }
         let layout = Layout::new(&found, self.positions_m.len());
-        // With motion alone first, which shows whether points are where bearings meet.
-        let by_motion = adjust::solve(layout.count, &self.equations(&layout, &found, &[]));
-        let Some(mut solution) = by_motion else { return left_alone(NotATrack::Undetermined) };
-        let seeing = self.seeing(&layout, &found, learned, &solution);
-        let used: Vec<usize> = learned.iter().copied().filter(|&row| seeing.contains(&self.recording[row])).collect();
-        let mut equations = self.equations(&layout, &found, &seeing);
-        let refined = |equations: &[Equation], solution| self.refined(&layout, equations, &used, solution);
-        match refined(&equations, solution) {
-            Some(better) => solution = better,
-            None => return left_alone(NotATrack::Undetermined),
-        }
-        let mut views = Vec::new();
-        if let Some(similarity) = similarity {
-            let rows: Vec<usize> = learned.iter().copied().filter(|&row| layout.first[row].is_some()).collect();
-            let receiver_std_m = found.iter().map(|(_, track)| track.noise.receiver_std_m).fold(0.0, f64::max);
-            let reach_m = REACH_SPACINGS * self.spacing_m + REACH_DEVIATIONS * receiver_std_m;
-            let passes = Passes {
-                positions_m: &self.corrected(&layout, &solution.unknowns),
-                recording: &self.recording,
-                rows: &rows,
-                reach_m,
-                spacing_m: self.spacing_m,
-            };
-            views = passes.views(similarity);
-            equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
-            match refined(&equations, solution) {
-                Some(with_views) => solution = with_views,
-                None => return left_alone(NotATrack::Undetermined),
-            }
-        }
+        let adjusted = if found.is_empty() { None } else { self.adjusted(&layout, &found, learned, similarity) };
+        let Some((solution, views)) = adjusted else { return self.left_alone() };
 
         let positions_m = self.corrected(&layout, &solution.unknowns);
-        let mut remaining_std_m = vec![0.0; self.positions_m.len()];
-        for (of, _) in &found {
-            let is_learned = |row: &usize| learned.binary_search(row).is_ok();
-            let (learned, others): (Vec<usize>, Vec<usize>) = of.rows.clone().partition(is_learned);
-            for rows in [learned, others] {
-                let mean_m = layout.mean_std_m(&solution, &rows);
-                rows.into_iter().for_each(|row| remaining_std_m[row] = mean_m);
-            }
-        }
+        let remaining_std_m = self.remaining_std_m(&layout, &found, learned, &solution);
         let report = |of: &RecordingTrack| match &of.track {
             Err(why) => TrackReport::LeftAlone(*why),
             Ok(track) => {
-                let n = of.rows.len() as f64;
-                let moved_m2: f64 =
-                    of.rows.clone().map(|row| distance_m(positions_m[row], self.positions_m[row]).powi(2)).sum();
-                let variance_m2 = remaining_std_m[of.rows.clone()].iter().map(|std_m| std_m * std_m).sum::<f64>() / n;
+                let rms = |value: &dyn Fn(usize) -> f64| {
+                    (of.rows.clone().map(|row| value(row).powi(2)).sum::<f64>() / of.rows.len() as f64).sqrt()
+                };
                 TrackReport::Smoothed {
                     receiver_std_m: track.noise.receiver_std_m,
                     receiver_time_s: track.noise.receiver_time_s,
-                    moved_m: (moved_m2 / n).sqrt(),
-                    remaining_std_m: variance_m2.sqrt(),
+                    moved_m: rms(&|row| distance_m(positions_m[row], self.positions_m[row])),
+                    remaining_std_m: rms(&|row| remaining_std_m[row]),
                     views: views.iter().filter(|view| of.rows.contains(&view.frame)).count(),
                 }
             }
         };
         Smoothed { reports: self.tracks.iter().map(report).collect(), remaining_std_m, positions_m }
+    }
+
+    fn left_alone(&self) -> Smoothed {
+        let why = |of: &RecordingTrack| of.track.as_ref().err().copied().unwrap_or(NotATrack::Undetermined);
+        Smoothed {
+            positions_m: self.positions_m.clone(),
+            remaining_std_m: vec![0.0; self.positions_m.len()],
+            reports: self.tracks.iter().map(|of| TrackReport::LeftAlone(why(of))).collect(),
+        }
+    }
+
+    /// By motion alone first, which shows whether points are where bearings meet; with these; and then with other passes,
+    /// which are looked for where the bearings say.
+    fn adjusted(
+        &self,
+        layout: &Layout,
+        found: &[(&RecordingTrack, &Track)],
+        learned: &[usize],
+        similarity: Option<&Similarity>,
+    ) -> Option<(Solution, Vec<View>)> {
+        let by_motion = adjust::solve(layout.count, &self.equations(layout, found, &[]))?;
+        let seeing = self.seeing(layout, found, learned, &by_motion);
+        let used: Vec<usize> = learned.iter().copied().filter(|&row| seeing.contains(&self.recording[row])).collect();
+        let mut equations = self.equations(layout, found, &seeing);
+        let solution = self.refined(layout, &equations, &used, by_motion)?;
+        let Some(similarity) = similarity else { return Some((solution, Vec::new())) };
+
+        let rows: Vec<usize> = learned.iter().copied().filter(|&row| layout.first[row].is_some()).collect();
+        let receiver_std_m = found.iter().map(|(_, track)| track.noise.receiver_std_m).fold(0.0, f64::max);
+        let passes = Passes {
+            positions_m: &self.corrected(layout, &solution.unknowns),
+            recording: &self.recording,
+            rows: &rows,
+            reach_m: REACH_SPACINGS * self.spacing_m + REACH_DEVIATIONS * receiver_std_m,
+            spacing_m: self.spacing_m,
+        };
+        let views = passes.views(similarity);
+        equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
+        Some((self.refined(layout, &equations, &used, solution)?, views))
+    }
+
+    /// Of every row: the mean over a recording's frames that are `learned`, or over its others.
+    fn remaining_std_m(
+        &self,
+        layout: &Layout,
+        found: &[(&RecordingTrack, &Track)],
+        learned: &[usize],
+        solution: &Solution,
+    ) -> Vec<f64> {
+        let mut std_m = vec![0.0; self.positions_m.len()];
+        for (of, _) in found {
+            let is_learned = |row: &usize| learned.binary_search(row).is_ok();
+            let (learned, others): (Vec<usize>, Vec<usize>) = of.rows.clone().partition(is_learned);
+            for rows in [learned, others] {
+                let mean_m = layout.mean_std_m(solution, &rows);
+                rows.into_iter().for_each(|row| std_m[row] = mean_m);
+            }
+        }
+        std_m
     }
 
     /// What is known without any image; the speed of the recordings `seeing` counts for less.
@@ -206,9 +216,9 @@ impl TrackSmoother {
         for (k, (of, track)) in found.iter().enumerate() {
             let unknowns = layout.of_track(of, k);
             let is_seeing = seeing.contains(&self.recording[of.rows.start]);
+            let speed_stds = if is_seeing { SPEED_STDS_BESIDE_BEARINGS } else { 1.0 };
             equations.extend(track.receiver_equations(unknowns));
-            equations
-                .extend(track.vehicle_equations(unknowns, if is_seeing { SPEED_STDS_BESIDE_BEARINGS } else { 1.0 }));
+            equations.extend(track.vehicle_equations(unknowns, speed_stds));
         }
         equations
     }
@@ -252,7 +262,8 @@ impl TrackSmoother {
         }
     }
 
-    /// Weighs `equations`, and takes bearings from the frames `learned`, about the positions so far, a round for each of [`LOOSENINGS`].
+    /// Weighs `equations`, and takes bearings from the frames `learned`, about the positions so far, a round for each of
+    /// [`LOOSENINGS`].
     fn refined(
         &self,
         layout: &Layout,
