@@ -3,7 +3,7 @@
     python3 benches/kidnap/kidnap.py AREA.map DATASET [--count 30] [--least-m 40] [--truth CSV] [--config FILE]
 
 DATASET is a folder that `omniloc import` reads, of another day than the map's. Needs nothing but the program
-(target/release/omniloc). Prints, for every kidnap, after how many frames it was noticed, after how many the position was
+(target/release/omniloc, or OMNILOC). Prints, for every kidnap, after how many frames it was noticed, after how many the position was
 known again, and how many positions in between were off by more than 10 m.
 """
 
@@ -18,7 +18,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-PROGRAM = Path(__file__).resolve().parents[2] / "target/release/omniloc"
+PROGRAM = Path(os.environ.get("OMNILOC", Path(__file__).resolve().parents[2] / "target/release/omniloc"))
 BEFORE, AFTER = 20, 30
 WRONG_M = 10.0
 
