@@ -35,7 +35,7 @@ pub struct Solution {
 /// Degrees of freedom of Student's t, as which errors with outliers are modelled.
 const FREEDOM: f64 = 4.0;
 const REWEIGHTINGS: usize = 8;
-/// Residuals that are a larger share of their length are wrong anyhow.
+/// A residual that is a larger share of its length is no share of it.
 const MOST_SHARE: f64 = 0.5;
 
 impl Linear {
@@ -65,13 +65,12 @@ impl Equation {
     pub fn about(&self, unknowns: &[f64]) -> Self {
         let Some(length) = &self.length else { return self.clone() };
         let residual = self.residual(unknowns);
-        // A vehicle that stands has no length.
         let share = residual / length.at(unknowns);
-        if !share.is_finite() {
+        // Not where a vehicle stands, and is no length on its way.
+        if !share.is_finite() || share.abs() > MOST_SHARE {
             return self.clone();
         }
         // d(ℓ₀ r / ℓ) = dr − (r₀ / ℓ₀) dℓ, and dr = −Σ coefficient · d(unknown).
-        let share = share.clamp(-MOST_SHARE, MOST_SHARE);
         let mut terms = self.terms.clone();
         terms.extend(length.terms.iter().map(|&(at, coefficient)| (at, share * coefficient)));
         let right = residual + sum(&terms, unknowns);

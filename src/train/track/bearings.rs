@@ -42,8 +42,8 @@ pub struct Frames<'a> {
     pub yaw_error_rad: &'a [f64],
     /// East and north error of a row, and after them that of its yaw.
     pub first_unknown: &'a [Option<usize>],
-    /// The camera's azimuth.
-    pub camera: usize,
+    /// The azimuth of a row's camera to the yaw: it may differ from recording to recording.
+    pub camera: &'a [usize],
     /// Bearings count, and are taken for those of a point, as if they erred by so many times what they do.
     pub loosening: f64,
 }
@@ -89,10 +89,14 @@ impl Frames<'_> {
         parts.filter_map(|part| self.equations_of(&part)).flatten().collect()
     }
 
-    /// How many of the parts of all `tracks` that `is_used` leaves meet somewhere.
+    /// How many of the parts of all `tracks` that `is_used` leaves meet somewhere, of those that could: while a vehicle stands,
+    /// none does.
     pub fn meetings(&self, tracks: &[PointTrack], is_used: impl Fn(usize) -> bool) -> Meetings {
         let mut found = Meetings::default();
         for part in tracks.iter().flat_map(|track| track.parts(&is_used)) {
+            if !self.has_parallax(&part) {
+                continue;
+            }
             found.parts += 1;
             if self.triangulated(&part).is_some() {
                 found.met += 1;
@@ -134,7 +138,8 @@ impl Frames<'_> {
             reflect(&mut of_point, &mut terms, axis);
         }
         let first: Vec<usize> = bearings.iter().filter_map(|&(row, _)| self.first_unknown[row]).collect();
-        let unknown = |k: usize| if k == 3 * m { self.camera } else { first[k / 3] + k % 3 };
+        let camera = self.camera[bearings[0].0];
+        let unknown = |k: usize| if k == 3 * m { camera } else { first[k / 3] + k % 3 };
         let equation = |row: &Vec<f64>| Equation {
             terms: row[..=3 * m].iter().enumerate().map(|(k, &value)| (unknown(k), value)).collect(),
             right: row[3 * m + 1],
@@ -145,14 +150,24 @@ impl Frames<'_> {
         Some(terms[2..].iter().map(equation).collect())
     }
 
+    /// From east, counter-clockwise.
+    fn direction_rad(&self, (row, azimuth_rad): (usize, f64)) -> f64 {
+        self.yaw_rad[row] + azimuth_rad - self.yaw_error_rad[row]
+    }
+
+    fn has_parallax(&self, bearings: &[(usize, f64)]) -> bool {
+        let first_rad = self.direction_rad(bearings[0]);
+        bearings
+            .iter()
+            .any(|&bearing| wrap_angle_rad(self.direction_rad(bearing) - first_rad).abs() >= LEAST_PARALLAX_RAD)
+    }
+
     /// The point that the bearings meet at; `None` where they meet at none.
     fn triangulated(&self, bearings: &[(usize, f64)]) -> Option<Triangulated> {
-        let direction = |&(row, azimuth_rad): &(usize, f64)| self.yaw_rad[row] + azimuth_rad - self.yaw_error_rad[row];
-        let first = direction(&bearings[0]);
-        let parallax = bearings.iter().map(|bearing| wrap_angle_rad(direction(bearing) - first).abs());
-        if parallax.fold(0.0, f64::max) < LEAST_PARALLAX_RAD {
+        if !self.has_parallax(bearings) {
             return None;
         }
+        let direction = |&bearing: &(usize, f64)| self.direction_rad(bearing);
         let mut found =
             Triangulated { point_m: [0.0; 2], misses: vec![0.0; bearings.len()], weights: vec![1.0; bearings.len()] };
         // By distances from the lines first, then by angles.
@@ -237,12 +252,15 @@ mod tests {
     struct Street {
         truth_m: Vec<PositionM>,
         received_m: Vec<PositionM>,
+        /// As measured, and what it is off by with the camera.
         yaw_rad: Vec<f64>,
+        yaw_error_rad: Vec<f64>,
         tracks: Vec<PointTrack>,
     }
 
     impl Street {
-        fn new(error_m: f64) -> Self {
+        /// The camera is turned by `camera_rad`, and the yaw of every other frame off by as much.
+        fn new(error_m: f64, camera_rad: f64) -> Self {
             let mut random = ChaCha8Rng::seed_from_u64(4);
             let mut normal = || f64::from(standard_normal(&mut random));
             let on_circle = |i: usize| {
@@ -253,19 +271,21 @@ mod tests {
             let mut received_m: Vec<PositionM> = truth_m.iter().map(|p| p.map(|x| x + error_m * normal())).collect();
             received_m[0] = truth_m[0];
             received_m[29] = truth_m[29];
-            let yaw_rad: Vec<f64> = (0..30).map(|i| 0.05 * i as f64).collect();
+            let error_rad = |i: usize| if i.is_multiple_of(2) { camera_rad } else { 0.0 };
+            let yaw_rad: Vec<f64> = (0..30).map(|i| 0.05 * i as f64 + error_rad(i)).collect();
+            let yaw_error_rad: Vec<f64> = (0..30).map(|i| error_rad(i) + camera_rad).collect();
             let tracks = (0..60)
                 .map(|k| {
                     let first = (7 * k) % 25;
                     let point = [truth_m[first][0] + 12.0 * normal(), truth_m[first][1] + 12.0 * normal()];
                     let bearing = |row: usize| {
                         let to = [point[0] - truth_m[row][0], point[1] - truth_m[row][1]];
-                        (row, to[1].atan2(to[0]) - yaw_rad[row])
+                        (row, to[1].atan2(to[0]) - yaw_rad[row] + yaw_error_rad[row])
                     };
                     PointTrack { bearings: (first..first + 6).map(bearing).collect() }
                 })
                 .collect();
-            Self { truth_m, received_m, yaw_rad, tracks }
+            Self { truth_m, received_m, yaw_rad, yaw_error_rad, tracks }
         }
 
         fn frames<'a>(
@@ -274,8 +294,15 @@ mod tests {
             first_unknown: &'a [Option<usize>],
             loosening: f64,
         ) -> Frames<'a> {
-            let (received_m, yaw_rad) = (&self.received_m, &self.yaw_rad);
-            Frames { positions_m, received_m, yaw_rad, yaw_error_rad: &[0.0; 30], first_unknown, camera: 90, loosening }
+            Frames {
+                positions_m,
+                received_m: &self.received_m,
+                yaw_rad: &self.yaw_rad,
+                yaw_error_rad: &self.yaw_error_rad,
+                first_unknown,
+                camera: &[90; 30],
+                loosening,
+            }
         }
     }
 
@@ -285,12 +312,14 @@ mod tests {
 
     #[test]
     fn the_truth_solves_the_equations() {
-        let (street, first_unknown) = (Street::new(0.3), first_unknown());
+        let (street, first_unknown) = (Street::new(0.3, 0.02), first_unknown());
         let equations = street.frames(&street.truth_m, &first_unknown, 1.0).equations(&street.tracks, |_| true);
         assert!(equations.len() > 100, "{}", equations.len());
+        const CAMERA: usize = 30;
         let error = |at: usize| match (at / 3, at % 3) {
-            (row, axis @ 0..2) if row < 30 => street.received_m[row][axis] - street.truth_m[row][axis],
-            _ => 0.0,
+            (CAMERA, _) => 0.02,
+            (row, axis @ 0..2) => street.received_m[row][axis] - street.truth_m[row][axis],
+            (row, _) => street.yaw_error_rad[row] - 0.02,
         };
         for equation in &equations {
             let left: f64 = equation.terms.iter().map(|&(at, value)| value * error(at)).sum();
@@ -300,7 +329,7 @@ mod tests {
 
     #[test]
     fn two_ends_and_bearings_give_the_rest() {
-        let (street, first_unknown) = (Street::new(0.3), first_unknown());
+        let (street, first_unknown) = (Street::new(0.3, 0.0), first_unknown());
         let mut positions_m = street.received_m.clone();
         for loosening in [8.0, 4.0, 2.0, 1.0, 1.0, 1.0] {
             let frames = street.frames(&positions_m, &first_unknown, loosening);
@@ -322,14 +351,14 @@ mod tests {
 
     #[test]
     fn what_meets_nowhere_is_left_out() {
-        let (mut street, first_unknown) = (Street::new(0.0), first_unknown());
+        let (mut street, first_unknown) = (Street::new(0.0, 0.0), first_unknown());
         for track in &mut street.tracks {
             // Another point from the fourth sighting on, on the other side of the street.
             track.bearings[3..].iter_mut().for_each(|(_, azimuth_rad)| *azimuth_rad += 2.0);
         }
         let frames = street.frames(&street.truth_m, &first_unknown, 1.0);
         assert!(frames.equations(&street.tracks, |_| true).is_empty());
-        let unseen = Street::new(0.0);
+        let unseen = Street::new(0.0, 0.0);
         assert!(
             unseen
                 .frames(&unseen.truth_m, &first_unknown, 1.0)

@@ -2,6 +2,8 @@
 
 use std::f64::consts::TAU;
 
+use rayon::prelude::*;
+
 use crate::panorama::{WIDE_COLUMNS, WIDE_ROWS};
 use crate::types::AzimuthSense;
 
@@ -10,6 +12,8 @@ const LEVELS: usize = 3;
 /// Points followed at a time, and how far apart new ones must be \[px\].
 const POINTS: usize = 150;
 const APART_PX: f32 = 8.0;
+/// Points that come nearer to each other than this \[px\] are one.
+const LEAST_APART_PX: f32 = 2.0;
 /// A point is a square of pixels, this many to either side of the middle.
 const HALF_PX: usize = 4;
 const SIDE_PX: usize = 2 * HALF_PX + 1;
@@ -79,7 +83,14 @@ impl PointFollower {
                 AzimuthSense::Ccw => turned,
                 AzimuthSense::Cw => -turned,
             } as f32;
-            points.extend(before.points.iter().filter_map(|point| point.followed(&before.pyramid, &pyramid, turned)));
+            let followed: Vec<Option<Point>> =
+                before.points.par_iter().map(|point| point.followed(&before.pyramid, &pyramid, turned)).collect();
+            for point in followed.into_iter().flatten() {
+                // Two that look alike may come to be one, which would count twice.
+                if points.iter().all(|other: &Point| apart_px(other.at, point.at) >= LEAST_APART_PX) {
+                    points.push(point);
+                }
+            }
         }
         self.add_new(&pyramid[0], &mut points);
         let sightings = points.iter().map(|point| {
@@ -366,5 +377,20 @@ mod tests {
         let kept = second.iter().filter(|there| first.iter().any(|here| here.point == there.point)).count();
         assert!(kept < first.len() / 10, "{kept} of {}", first.len());
         assert!(follower.take(&vec![80.0; WIDE_ROWS * WIDE_COLUMNS], 0.0).is_empty());
+    }
+
+    #[test]
+    fn two_points_that_come_to_be_one_count_once() {
+        let blob = |at: &[f32]| -> Vec<f32> {
+            let value = |i: usize| {
+                let [x, y] = [(i % WIDE_COLUMNS) as f32, (i / WIDE_COLUMNS) as f32];
+                let height = |&middle: &f32| 90.0 * (-((x - middle).powi(2) + (y - 60.0).powi(2)) / 18.0).exp();
+                80.0 + at.iter().map(height).sum::<f32>()
+            };
+            (0..WIDE_ROWS * WIDE_COLUMNS).map(value).collect()
+        };
+        let mut follower = PointFollower::new(AzimuthSense::Ccw);
+        assert_eq!(follower.take(&blob(&[100.0, 112.0]), 0.0).len(), 2);
+        assert_eq!(follower.take(&blob(&[106.0]), 0.0).len(), 1);
     }
 }

@@ -257,7 +257,7 @@ impl TrackSmoother {
             yaw_rad: &self.yaw_rad,
             yaw_error_rad,
             first_unknown: &layout.first,
-            camera: layout.camera,
+            camera: &layout.camera,
             loosening,
         }
     }
@@ -277,8 +277,9 @@ impl TrackSmoother {
             let yaw_errors_rad = layout.yaw_errors_rad(&solution.unknowns);
             let frames = self.frames(layout, &positions_m, &yaw_errors_rad, loosening);
             let bearings = frames.equations(&self.points, is_used);
-            let equations: Vec<Equation> = equations.iter().map(|e| e.about(&solution.unknowns)).collect();
-            solution = adjust::solve_about(&solution.unknowns, &[equations, bearings].concat())?;
+            let mut all: Vec<Equation> = equations.iter().map(|e| e.about(&solution.unknowns)).collect();
+            all.extend(bearings);
+            solution = adjust::solve_about(&solution.unknowns, &all)?;
         }
         Some(solution)
     }
@@ -294,12 +295,14 @@ impl TrackSmoother {
 }
 
 /// Where the unknowns are: the tracks one after the other, east error, north error and yaw's error of each frame; the errors
-/// of the courses and of the camera last, where they make no row long but their own.
+/// of the courses and of the camera's azimuths last, where they make no row long but their own.
 struct Layout {
     /// Of every row of the survey; `None` where it is of no track.
     first: Vec<Option<usize>>,
+    /// Of every row, that of its track; of no use where it is of none.
+    camera: Vec<usize>,
     courses: usize,
-    camera: usize,
+    tracks: usize,
     count: usize,
 }
 
@@ -313,8 +316,11 @@ impl Layout {
             first[row] = Some(courses);
             courses += UNKNOWNS_A_FRAME;
         }
-        let camera = courses + found.len();
-        Self { first, courses, camera, count: camera + 1 }
+        let mut camera = vec![0; rows];
+        for (k, (of, _)) in found.iter().enumerate() {
+            camera[of.rows.clone()].fill(courses + found.len() + k);
+        }
+        Self { first, camera, courses, tracks: found.len(), count: courses + 2 * found.len() }
     }
 
     /// Those of the track number `k`.
@@ -329,7 +335,8 @@ impl Layout {
             let unknowns = of.rows.clone().filter_map(|row| self.first[row]);
             unknowns.map(|first| bearings::yaw_prior(first + 2, std_rad)).collect::<Vec<_>>()
         };
-        found.iter().flat_map(of_track).chain([bearings::camera_prior(self.camera)]).collect()
+        let cameras = self.courses + self.tracks..self.count;
+        found.iter().flat_map(of_track).chain(cameras.map(bearings::camera_prior)).collect()
     }
 
     /// Mean deviation of the positions of `rows`, on either axis.
@@ -344,7 +351,10 @@ impl Layout {
 
     /// Of every row.
     fn yaw_errors_rad(&self, unknowns: &[f64]) -> Vec<f64> {
-        self.first.iter().map(|first| first.map_or(0.0, |first| unknowns[first + 2] + unknowns[self.camera])).collect()
+        let of_row = |(first, &camera): (&Option<usize>, &usize)| {
+            first.map_or(0.0, |first| unknowns[first + 2] + unknowns[camera])
+        };
+        self.first.iter().zip(&self.camera).map(of_row).collect()
     }
 }
 

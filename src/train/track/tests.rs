@@ -256,10 +256,11 @@ fn points_take_off_more_than_motion_and_nothing_where_the_camera_looks_elsewhere
         };
         let without = by_motion.smoothed(&everything, None);
         assert_eq!(with_points(1.5), without, "its points are nowhere");
-        for (sum, of) in sums.iter_mut().zip([&without, &with_points(0.0)]) {
+        // A camera that is turned a little does not matter.
+        for (sum, of) in sums.iter_mut().zip([&without, &with_points(0.05)]) {
             *sum += rmse_about_mean_m(&of.positions_m, &truth_m);
         }
     }
     let [by_motion, by_points] = sums;
-    assert!(by_points < 0.8 * by_motion, "{by_points} of {by_motion}");
+    assert!(by_points < 0.85 * by_motion, "{by_points} of {by_motion}");
 }
