@@ -51,6 +51,37 @@ fn data_sets_give_their_own_calibration() {
 }
 
 #[test]
+fn recordings_are_looked_at_together_and_those_without_images_left_out() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (drive, other, useless) =
+        (folder.path().join("a.mcap"), folder.path().join("b.mcap"), folder.path().join("c.mcap"));
+    let dataset = folder.path().join("dataset");
+    std::fs::create_dir_all(dataset.join("images")).expect("a folder");
+    std::fs::copy(data("drive").join("donut.json"), dataset.join("donut.json")).expect("copies");
+    let mut rows = String::from("index,file,x_m,y_m,yaw_rad,time_s\n");
+    for (index, entry) in std::fs::read_dir(data("drive").join("images")).expect("a folder").flatten().enumerate() {
+        std::fs::copy(entry.path(), dataset.join("images").join(entry.file_name())).expect("copies");
+        rows += &format!("{index},{},{index},0,,\n", entry.file_name().display());
+    }
+    std::fs::write(dataset.join("positions.csv"), rows).expect("writes");
+    for out in [&drive, &other] {
+        let mut import = Command::cargo_bin("omniloc").expect("the program is built");
+        import.arg("import").arg(&dataset).arg("--out").arg(out).assert().success();
+    }
+    let file = std::fs::File::create(&useless).expect("creates");
+    mcap::Writer::new(file).and_then(|mut writer| writer.finish()).expect("writes");
+    let output = calibrate(&[&drive, &other, &useless], folder.path()).output().expect("it runs");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && stderr.contains("c.mcap: no images on /camera/image"), "{stderr}");
+    let (center_px, radius_px) =
+        errors_px(&calibration(&folder.path().join("donut.json")), &calibration(&data("drive").join("donut.json")));
+    assert!(center_px < 1.5 && radius_px < 0.3, "{center_px} {radius_px}");
+
+    let output = calibrate(&[&useless], folder.path()).output().expect("it runs");
+    assert!(!output.status.success() && String::from_utf8_lossy(&output.stderr).contains("no images"));
+}
+
+#[test]
 fn one_image_is_enough_and_options_set_what_it_cannot_show() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let image = data("drive").join("images/0100.jpg");

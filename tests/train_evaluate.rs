@@ -39,6 +39,29 @@ fn folder() -> TempDir {
 const QUICK: [&str; 6] = ["--features", "gradient", "--recipe", "default", "--split", "random"];
 
 #[test]
+fn a_recording_without_a_usable_frame_is_left_out_beside_others() {
+    let folder = folder();
+    let (good, useless) = (recording(&folder, 12), folder.path().join("useless.mcap"));
+    let file = fs::File::create(&useless).expect("creates");
+    mcap::Writer::new(file).and_then(|mut writer| writer.finish()).expect("writes");
+    let map = folder.path().join("area.map");
+    let train = |recordings: &[&PathBuf]| {
+        run(omniloc().arg("train").args(recordings).arg("--out").arg(&map).args([
+            "--grid-step-m",
+            "20",
+            "--features",
+            "gradient",
+        ]))
+    };
+    let (code, _, stderr) = train(&[&useless]);
+    assert!(code == 1 && stderr.contains("no usable frame") && !map.exists(), "{code} {stderr}");
+    let (code, stdout, stderr) = train(&[&useless, &good]);
+    assert_eq!(code, 0, "{stderr}");
+    assert!(stderr.contains("note: left out: ") && stderr.contains("useless.mcap: no usable frame"), "{stderr}");
+    assert!(stdout.contains("trained on     courtyard, 12 frames"), "{stdout}");
+}
+
+#[test]
 fn a_map_is_trained_shown_checked_and_measured_against() {
     let folder = folder();
     let recording = recording(&folder, 24);

@@ -18,7 +18,7 @@ use crate::types::{AzimuthSense, DonutCalibration, LumaImage};
 /// existing calibration of the recording or data set, else from the defaults of the options below.
 #[derive(Debug, clap::Args)]
 pub struct CalibrateArgs {
-    /// A recording (.mcap), a data-set folder, or image files
+    /// Recordings (.mcap), a data-set folder, or image files
     #[arg(required = true)]
     input: Vec<PathBuf>,
     /// Where the calibration goes

@@ -1,4 +1,4 @@
-//! Luma images from a data-set folder or image files, decoded one at a time.
+//! Luma images from recordings, a data-set folder or image files, decoded one at a time.
 
 use std::path::{Path, PathBuf};
 
@@ -16,17 +16,43 @@ pub struct FrameSource {
     pub calibration: Option<DonutCalibration>,
 }
 
-/// Opens what the user named: one recording, one data-set folder, or image files. At most `limit` frames, spread evenly.
+/// Opens what the user named: recordings, one data-set folder, or image files. About `limit` frames at most, spread evenly.
 pub fn open(inputs: &[PathBuf], limit: usize) -> anyhow::Result<FrameSource> {
     match inputs {
-        [recording] if has_extension(recording, &["mcap"]) => open_recording(recording, limit),
+        recordings if recordings.iter().all(|path| has_extension(path, &["mcap"])) => {
+            open_recordings(recordings, limit)
+        }
         [folder] if folder.is_dir() => open_folder(folder, limit),
         files => Ok(FrameSource { frames: decode_all(spread_evenly(files.to_vec(), limit)), calibration: None }),
     }
 }
 
+/// Frames of all recordings, as many of each, and the first calibration that is attached to one. Some may have no images: what
+/// a start of the vehicle leaves at which the camera never came.
+fn open_recordings(paths: &[PathBuf], limit: usize) -> anyhow::Result<FrameSource> {
+    let (mut jpegs, mut calibration, mut useless) = (Vec::new(), None, None);
+    for path in paths {
+        let (of_recording, known) = jpegs_of(path, limit.div_ceil(paths.len()))?;
+        if of_recording.is_empty() {
+            let what = format!("{}: no images on {}", path.display(), CAMERA_IMAGE.name);
+            if paths.len() > 1 {
+                eprintln!("note: left out: {what}");
+            }
+            useless = Some(what);
+        }
+        jpegs.extend(of_recording);
+        calibration = calibration.or(known);
+    }
+    if let (true, Some(what)) = (jpegs.is_empty(), useless) {
+        bail!(what);
+    }
+    let mut decoder = LumaDecoder::new();
+    let frames = jpegs.into_iter().map(move |jpeg| Ok(decoder.decode(&jpeg)?.clone()));
+    Ok(FrameSource { frames: Box::new(frames), calibration })
+}
+
 /// Frames of `/camera/image`, whether a position belongs to them or not, and the calibration attached to the recording.
-fn open_recording(path: &Path, limit: usize) -> anyhow::Result<FrameSource> {
+fn jpegs_of(path: &Path, limit: usize) -> anyhow::Result<(Vec<Vec<u8>>, Option<DonutCalibration>)> {
     let recording = Recording::open_any(path)?;
     let images = recording.topics.get(CAMERA_IMAGE.name).map_or(0, |topic| topic.messages as usize);
     let wanted = spread_evenly((0..images).collect(), limit);
@@ -39,12 +65,7 @@ fn open_recording(path: &Path, limit: usize) -> anyhow::Result<FrameSource> {
         number += 1;
         jpegs.len() < wanted.len()
     })?;
-    if jpegs.is_empty() {
-        bail!("{}: no images on {}", path.display(), CAMERA_IMAGE.name);
-    }
-    let mut decoder = LumaDecoder::new();
-    let frames = jpegs.into_iter().map(move |jpeg| Ok(decoder.decode(&jpeg)?.clone()));
-    Ok(FrameSource { frames: Box::new(frames), calibration: recording.calibration().ok() })
+    Ok((jpegs, recording.calibration().ok()))
 }
 
 /// `images/` of a data set, or the folder itself when it has none; `donut.json` beside them if there is one.

@@ -9,7 +9,7 @@ use super::options::{check_input, check_not_input, with_folders};
 use super::progress::Progress;
 use crate::features::Descriptor;
 use crate::map::{PERTURBED_COPIES, Recipe};
-use crate::recording::Recording;
+use crate::recording::{Recording, RecordingError};
 use crate::train::{Survey, SurveyOptions, TrialError};
 use crate::types::{NS_PER_S, PositionM, counted, distance_m};
 
@@ -101,19 +101,32 @@ fn open_all(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
     for (i, path) in paths.iter().enumerate() {
         check_not_input(path, &paths[..i]).map_err(|_| BadArgument(format!("{} is named twice", path.display())))?;
     }
-    paths
-        .iter()
-        .map(|path| {
-            check_input(path)?;
-            let recording = Recording::open(path)?;
-            let unusable = recording.unusable.len();
-            if unusable > 0 {
-                let frames = counted(unusable, "frame");
-                eprintln!("note: {}: left out for want of a usable position: {frames}", path.display());
+    let (mut recordings, mut useless) = (Vec::new(), None);
+    for path in paths {
+        check_input(path)?;
+        match Recording::open(path) {
+            Ok(recording) => {
+                let unusable = recording.unusable.len();
+                if unusable > 0 {
+                    let frames = counted(unusable, "frame");
+                    eprintln!("note: {}: left out for want of a usable position: {frames}", path.display());
+                }
+                recordings.push(recording);
             }
-            Ok(recording)
-        })
-        .collect()
+            // What a start of the vehicle leaves at which camera or receiver never came.
+            Err(error @ RecordingError::NoUsablePair { .. }) => {
+                if paths.len() > 1 {
+                    eprintln!("note: left out: {error}");
+                }
+                useless = Some(error);
+            }
+            Err(error) => return Err(error.into()),
+        }
+    }
+    match useless {
+        Some(error) if recordings.is_empty() => Err(error.into()),
+        _ => Ok(recordings),
+    }
 }
 
 /// Reads what learning by `recipes` needs of all frames.

@@ -1,6 +1,10 @@
 //! What the computer says about itself: processor time, memory, temperature, throttling. What it does not say is absent.
 
-use std::fs;
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    sync::LazyLock,
+};
 
 use crate::types::NS_PER_S;
 
@@ -36,11 +40,32 @@ impl SystemMonitor {
             cpu_cores,
             resident_bytes: resident_bytes(),
             temperature_celsius: read_number::<i64>("/sys/class/thermal/thermal_zone0/temp").map(|m| m as f64 * 1e-3),
-            throttled: fs::read_to_string("/sys/devices/platform/soc/soc:firmware/get_throttled")
-                .ok()
+            throttled: THROTTLED
+                .as_ref()
+                .and_then(|path| fs::read_to_string(path).ok())
                 .and_then(|text| u32::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok()),
         }
     }
+}
+
+static THROTTLED: LazyLock<Option<PathBuf>> = LazyLock::new(|| find_throttled(Path::new("/sys/devices/platform")));
+
+/// What a Raspberry Pi says of its voltage: `soc/soc:firmware/get_throttled`, on a Pi 5 below `soc@107c000000:firmware`.
+fn find_throttled(platform: &Path) -> Option<PathBuf> {
+    let inside = |folder: &Path| {
+        let mut paths: Vec<PathBuf> =
+            fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+        paths.sort();
+        paths
+    };
+    let of_soc = inside(platform).into_iter().filter(|path| name_of(path).starts_with("soc"));
+    let firmware =
+        of_soc.flat_map(|soc| [inside(&soc), vec![soc]].concat()).filter(|path| name_of(path).ends_with(":firmware"));
+    firmware.map(|path| path.join("get_throttled")).find(|path| path.exists())
+}
+
+fn name_of(path: &Path) -> &str {
+    path.file_name().and_then(|name| name.to_str()).unwrap_or_default()
 }
 
 fn read_number<T: std::str::FromStr>(path: &str) -> Option<T> {
@@ -63,6 +88,21 @@ fn resident_bytes() -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_a_pi_says_of_its_voltage_is_found_on_every_kind() {
+        for firmware in ["soc/soc:firmware", "soc@107c000000:firmware", "axi/soc:firmware"] {
+            let platform = tempfile::tempdir().expect("a folder");
+            assert_eq!(find_throttled(platform.path()), None);
+            let folder = platform.path().join(firmware);
+            fs::create_dir_all(&folder).expect("a folder");
+            assert_eq!(find_throttled(platform.path()), None, "no such file");
+            let file = folder.join("get_throttled");
+            fs::write(&file, "0\n").expect("writes");
+            let expected = (!firmware.starts_with("axi")).then_some(file);
+            assert_eq!(find_throttled(platform.path()), expected);
+        }
+    }
 
     #[test]
     fn processor_time_and_memory_are_those_of_this_process() {
