@@ -62,6 +62,14 @@ fn a_map_that_is_missing_is_a_problem() {
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     assert!(findings(&output).contains(&("map".into(), "problem".into())));
 
+    // Everything else is looked at all the same.
+    fs::write(&config, text.replace("name = \"car\"", "name = \"car\"\ncalibration = \"none.json\"")).expect("writes");
+    let found = findings(&doctor(&config, &["--json"]));
+    for (check, verdict) in [("calibration", "problem"), ("map", "problem"), ("camera", "ok"), ("sandbox", "ok")] {
+        let is_there = found.iter().any(|(name, said)| name == check && (said == verdict || check == "sandbox"));
+        assert!(is_there, "{check}: {found:?}");
+    }
+
     fs::write(&config, "[vehicle]\nname = 3\n").expect("writes");
     assert_eq!(doctor(&config, &[]).status.code(), Some(2));
 }

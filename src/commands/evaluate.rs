@@ -77,9 +77,9 @@ pub struct Args {
         hide_possible_values = true
     )]
     pub variants: Vec<Variant>,
-    /// Correct the positions that are learned from, by how the vehicle moved and by places seen more than once; errors
-    /// are measured against the positions as they were recorded, or against --truth [default: track for the default
-    /// recipe, none for the paper's]
+    /// Correct the positions that are learned from, by points of the scene, how the vehicle moved and places seen more
+    /// than once; errors are measured against the positions as they were recorded, or against --truth [default: track
+    /// for the default recipe, none for the paper's]
     #[arg(long, value_enum)]
     pub smooth: Option<Smoothing>,
     /// What to compare with, separated by commas: none; nearest, the nearest learning image by z-scored properties;

@@ -30,7 +30,8 @@ pub fn open_recordings(paths: &[PathBuf], spacing_m: Option<f64>) -> anyhow::Res
         None => {
             let spacing_m = recordings.iter().map(Recording::length_m).sum::<f64>() / MAX_FRAMES as f64;
             eprintln!("note: {frames} frames are thinned to one every {spacing_m:.2} m; --spacing-m chooses otherwise");
-            spacing_m
+            recordings.iter_mut().for_each(|recording| recording.thin(spacing_m));
+            return Ok(recordings);
         }
     };
     recordings.iter_mut().for_each(|recording| recording.keep_spaced(spacing_m));

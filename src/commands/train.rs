@@ -65,7 +65,8 @@ pub struct Args {
     /// Leave out frames that are closer than this to the one before [m; default: as many as make 800 frames]
     #[arg(long, value_name = "M", value_parser = parse_spacing_m)]
     pub spacing_m: Option<f64>,
-    /// Correct the recorded positions before learning, by how the vehicle moved and by places seen more than once
+    /// Correct the recorded positions before learning, by points of the scene, how the vehicle moved and places
+    /// seen more than once
     /// [default: track for the default recipe, none for the paper's and with --update]
     #[arg(long, value_enum)]
     pub smooth: Option<Smoothing>,

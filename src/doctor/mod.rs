@@ -90,7 +90,12 @@ pub fn examine(purpose: &Purpose, mut each: impl FnMut(Finding)) -> anyhow::Resu
         (None, _) => None,
     };
 
-    let mut calibration = vehicle.calibration.as_deref().map(read_calibration).transpose()?;
+    let known = vehicle.calibration.as_deref().map(read_calibration).transpose();
+    let mut calibration = known.unwrap_or_else(|error| {
+        let advice = "`omniloc calibrate` makes one; without the key nothing is calibrated yet";
+        tell(vec![Finding::problem("calibration", format!("{error:#}"), advice)]);
+        None
+    });
     if let Purpose::Localize(config) = purpose {
         let (finding, of_map) = map(&config.map.file);
         tell(vec![finding]);

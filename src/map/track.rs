@@ -10,7 +10,7 @@ use super::RecipeName;
 pub enum Smoothing {
     /// They are taken as the receiver gave them.
     None,
-    /// By how the vehicle moved and by places seen more than once, where a recording is a track.
+    /// By points of the scene, how the vehicle moved and places seen more than once, where a recording is a track.
     Track,
 }
 

@@ -156,6 +156,20 @@ impl Recording {
         });
     }
 
+    /// Keeps the first frame, and then each one that is the first to get past a multiple of `spacing_m` along the way: as many
+    /// as the way has spacings, if there are so many.
+    pub fn thin(&mut self, spacing_m: f64) {
+        let (mut way_m, mut next_m, mut last_m) = (0.0, 0.0, None);
+        self.survey.retain(|frame| {
+            way_m += last_m.replace(frame.position_m).map_or(0.0, |last_m| distance_m(last_m, frame.position_m));
+            let keep = way_m >= next_m;
+            if keep {
+                next_m = ((way_m / spacing_m).floor() + 1.0) * spacing_m;
+            }
+            keep
+        });
+    }
+
     /// The attachment `donut.json` as it was written.
     pub fn calibration_json(&self) -> Option<&[u8]> {
         self.calibration_json.as_deref()
@@ -375,6 +389,14 @@ mod tests {
         // A thousandth of a degree at 48 degrees north: a cos φ / sqrt(1 - e² sin² φ) plus the altitude.
         let [east_m, north_m] = recording.survey[0].position_m;
         assert!((east_m - (10.0 - 74.634)).abs() < 0.01 && north_m.abs() < 0.001, "{east_m} {north_m}");
+
+        // Half a metre a frame, and a spacing a little larger: hardly more than one in five goes.
+        let mut thinned = recording.clone();
+        let first = thinned.survey[0].clone();
+        let frame = |i: usize| SurveyFrame { position_m: [0.5 * i as f64, 0.0], index: i, ..first.clone() };
+        thinned.survey = (0..1000).map(frame).collect();
+        thinned.thin(0.5 * 999.0 / 800.0);
+        assert!((799..=801).contains(&thinned.survey.len()), "{}", thinned.survey.len());
 
         recording.keep_spaced(1.0);
         assert_eq!(recording.survey.iter().map(|frame| frame.index).collect::<Vec<_>>(), [1, 3]);
