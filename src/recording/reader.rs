@@ -90,7 +90,6 @@ impl Recording {
     /// The whole file is read once, chunk by chunk, and all CRCs are checked.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let recording = Self::open_any(path)?;
-        recording.calibration()?;
         if recording.survey.is_empty() {
             let messages =
                 |topic: topics::Topic| recording.topics.get(topic.name).map_or(0, |summary| summary.messages);
@@ -101,6 +100,7 @@ impl Recording {
                 usable: 0,
             });
         }
+        recording.calibration()?;
         Ok(recording)
     }
 
