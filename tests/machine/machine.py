@@ -5,6 +5,7 @@ through QEMU's monitor; both speak JSON over a socket.
 """
 
 import base64
+import contextlib
 import json
 import select
 import shlex
@@ -36,7 +37,10 @@ class Conversation:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0 or not select.select([self.socket], [], [], left_s)[0]:
                 return None
-            received = self.socket.recv(1 << 16)
+            try:
+                received = self.socket.recv(1 << 16)
+            except ConnectionError:
+                received = b""
             if not received:
                 raise Failure("the machine went off")
             self.unread += received
@@ -196,7 +200,9 @@ class Machine:
 
     def shut_down(self) -> None:
         """As `poweroff` does."""
-        self.sh("systemctl poweroff --no-block")
+        # It may be off before it has said that it heard.
+        with contextlib.suppress(Failure):
+            self.sh("systemctl poweroff --no-block")
         self.process.wait(timeout=120)
         self.agent.close()
         self.monitor.close()
