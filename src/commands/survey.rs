@@ -24,17 +24,15 @@ pub fn open_recordings(paths: &[PathBuf], spacing_m: Option<f64>) -> anyhow::Res
     let mut recordings = open_all(&with_folders(paths)?)?;
     refuse_copies(&recordings)?;
     let frames = recordings.iter().map(|recording| recording.survey.len()).sum::<usize>();
-    let spacing_m = match spacing_m {
-        Some(spacing_m) => spacing_m,
-        None if frames <= MAX_FRAMES => return Ok(recordings),
+    match spacing_m {
+        Some(spacing_m) => recordings.iter_mut().for_each(|recording| recording.keep_spaced(spacing_m)),
+        None if frames <= MAX_FRAMES => {}
         None => {
             let spacing_m = recordings.iter().map(Recording::length_m).sum::<f64>() / MAX_FRAMES as f64;
             eprintln!("note: {frames} frames are thinned to one every {spacing_m:.2} m; --spacing-m chooses otherwise");
             recordings.iter_mut().for_each(|recording| recording.thin(spacing_m));
-            return Ok(recordings);
         }
-    };
-    recordings.iter_mut().for_each(|recording| recording.keep_spaced(spacing_m));
+    }
     Ok(recordings)
 }
 
@@ -162,6 +160,7 @@ fn read(
 ) -> anyhow::Result<Survey> {
     descriptors.sort_unstable();
     descriptors.dedup();
+    // Only for learning by a recipe that corrects positions.
     let follow = !fixed && !perturbed.is_empty();
     let options =
         SurveyOptions { descriptors, fixed, compass, follow, repetitions: PERTURBED_COPIES, perturbed, seed: 0 };

@@ -125,14 +125,12 @@ impl TrackSmoother {
 
     /// The most likely positions when images may be compared among the frames `learned`, in rising order.
     pub fn smoothed(&self, learned: &[usize], similarity: Option<&Similarity>) -> Smoothed {
-        let found: Vec<(&RecordingTrack, &Track)> =
-            self.tracks.iter().filter_map(|of| Some((of, of.track.as_ref().ok()?))).collect();
-        let layout = Layout::new(&found, self.positions_m.len());
-        let adjusted = if found.is_empty() { None } else { self.adjusted(&layout, &found, learned, similarity) };
+        let layout = Layout::new(&self.tracks, self.positions_m.len());
+        let adjusted = if layout.found.is_empty() { None } else { self.adjusted(&layout, learned, similarity) };
         let Some((solution, views)) = adjusted else { return self.left_alone() };
 
         let positions_m = self.corrected(&layout, &solution.unknowns);
-        let remaining_std_m = self.remaining_std_m(&layout, &found, learned, &solution);
+        let remaining_std_m = self.remaining_std_m(&layout, learned, &solution);
         let report = |of: &RecordingTrack| match &of.track {
             Err(why) => TrackReport::LeftAlone(*why),
             Ok(track) => {
@@ -165,19 +163,18 @@ impl TrackSmoother {
     fn adjusted(
         &self,
         layout: &Layout,
-        found: &[(&RecordingTrack, &Track)],
         learned: &[usize],
         similarity: Option<&Similarity>,
     ) -> Option<(Solution, Vec<View>)> {
-        let by_motion = adjust::solve(layout.count, &self.equations(layout, found, &[]))?;
-        let seeing = self.seeing(layout, found, learned, &by_motion);
+        let by_motion = adjust::solve(layout.count, &self.equations(layout, &[]))?;
+        let seeing = self.seeing(layout, learned, &by_motion);
         let used: Vec<usize> = learned.iter().copied().filter(|&row| seeing.contains(&self.recording[row])).collect();
-        let mut equations = self.equations(layout, found, &seeing);
+        let mut equations = self.equations(layout, &seeing);
         let solution = self.refined(layout, &equations, &used, by_motion)?;
         let Some(similarity) = similarity else { return Some((solution, Vec::new())) };
 
         let rows: Vec<usize> = learned.iter().copied().filter(|&row| layout.first[row].is_some()).collect();
-        let receiver_std_m = found.iter().map(|(_, track)| track.noise.receiver_std_m).fold(0.0, f64::max);
+        let receiver_std_m = layout.found.iter().map(|(_, track)| track.noise.receiver_std_m).fold(0.0, f64::max);
         let passes = Passes {
             positions_m: &self.corrected(layout, &solution.unknowns),
             recording: &self.recording,
@@ -191,15 +188,9 @@ impl TrackSmoother {
     }
 
     /// Of every row: the mean over a recording's frames that are `learned`, or over its others.
-    fn remaining_std_m(
-        &self,
-        layout: &Layout,
-        found: &[(&RecordingTrack, &Track)],
-        learned: &[usize],
-        solution: &Solution,
-    ) -> Vec<f64> {
+    fn remaining_std_m(&self, layout: &Layout, learned: &[usize], solution: &Solution) -> Vec<f64> {
         let mut std_m = vec![0.0; self.positions_m.len()];
-        for (of, _) in found {
+        for (of, _) in &layout.found {
             let is_learned = |row: &usize| learned.binary_search(row).is_ok();
             let (learned, others): (Vec<usize>, Vec<usize>) = of.rows.clone().partition(is_learned);
             for rows in [learned, others] {
@@ -211,9 +202,9 @@ impl TrackSmoother {
     }
 
     /// What is known without any image; the speed of the recordings `seeing` counts for less.
-    fn equations(&self, layout: &Layout, found: &[(&RecordingTrack, &Track)], seeing: &[usize]) -> Vec<Equation> {
-        let mut equations = layout.priors(found);
-        for (k, (of, track)) in found.iter().enumerate() {
+    fn equations(&self, layout: &Layout, seeing: &[usize]) -> Vec<Equation> {
+        let mut equations = layout.priors();
+        for (k, (of, track)) in layout.found.iter().enumerate() {
             let unknowns = layout.of_track(of, k);
             let is_seeing = seeing.contains(&self.recording[of.rows.start]);
             let speed_stds = if is_seeing { SPEED_STDS_BESIDE_BEARINGS } else { 1.0 };
@@ -225,13 +216,7 @@ impl TrackSmoother {
 
     /// The recordings whose frames `learned` see enough points, most of which are where their bearings meet: neither where
     /// it is dark nor where the camera looks elsewhere than the yaw says.
-    fn seeing(
-        &self,
-        layout: &Layout,
-        found: &[(&RecordingTrack, &Track)],
-        learned: &[usize],
-        by_motion: &Solution,
-    ) -> Vec<usize> {
+    fn seeing(&self, layout: &Layout, learned: &[usize], by_motion: &Solution) -> Vec<usize> {
         let positions_m = self.corrected(layout, &by_motion.unknowns);
         let yaw_errors_rad = layout.yaw_errors_rad(&by_motion.unknowns);
         let frames = self.frames(layout, &positions_m, &yaw_errors_rad, LOOSENINGS[1]);
@@ -241,7 +226,7 @@ impl TrackSmoother {
             let Meetings { parts, met, sightings } = frames.meetings(&self.points, is_used);
             rows > 0 && sightings >= ENOUGH_POINTS * rows && met as f64 >= LEAST_MET * parts as f64
         };
-        found.iter().filter(|(of, _)| is_seeing(of)).map(|(of, _)| self.recording[of.rows.start]).collect()
+        layout.found.iter().filter(|(of, _)| is_seeing(of)).map(|(of, _)| self.recording[of.rows.start]).collect()
     }
 
     fn frames<'a>(
@@ -296,20 +281,22 @@ impl TrackSmoother {
 
 /// Where the unknowns are: the tracks one after the other, east error, north error and yaw's error of each frame; the errors
 /// of the courses and of the camera's azimuths last, where they make no row long but their own.
-struct Layout {
+struct Layout<'a> {
+    /// The recordings that are tracks.
+    found: Vec<(&'a RecordingTrack, &'a Track)>,
     /// Of every row of the survey; `None` where it is of no track.
     first: Vec<Option<usize>>,
     /// Of every row, that of its track; of no use where it is of none.
     camera: Vec<usize>,
     courses: usize,
-    tracks: usize,
     count: usize,
 }
 
 const UNKNOWNS_A_FRAME: usize = 3;
 
-impl Layout {
-    fn new(found: &[(&RecordingTrack, &Track)], rows: usize) -> Self {
+impl<'a> Layout<'a> {
+    fn new(tracks: &'a [RecordingTrack], rows: usize) -> Self {
+        let found: Vec<_> = tracks.iter().filter_map(|of| Some((of, of.track.as_ref().ok()?))).collect();
         let mut first = vec![None; rows];
         let mut courses = 0;
         for row in found.iter().flat_map(|(of, _)| of.rows.clone()) {
@@ -320,7 +307,7 @@ impl Layout {
         for (k, (of, _)) in found.iter().enumerate() {
             camera[of.rows.clone()].fill(courses + found.len() + k);
         }
-        Self { first, camera, courses, tracks: found.len(), count: courses + 2 * found.len() }
+        Self { first, camera, courses, count: courses + 2 * found.len(), found }
     }
 
     /// Those of the track number `k`.
@@ -329,14 +316,14 @@ impl Layout {
         Unknowns { first, a_frame: UNKNOWNS_A_FRAME, has_yaw: true, course: self.courses + k }
     }
 
-    fn priors(&self, found: &[(&RecordingTrack, &Track)]) -> Vec<Equation> {
+    fn priors(&self) -> Vec<Equation> {
         let of_track = |(of, track): &(&RecordingTrack, &Track)| {
             let std_rad = track.noise.frame_yaw_std_rad();
             let unknowns = of.rows.clone().filter_map(|row| self.first[row]);
             unknowns.map(|first| bearings::yaw_prior(first + 2, std_rad)).collect::<Vec<_>>()
         };
-        let cameras = self.courses + self.tracks..self.count;
-        found.iter().flat_map(of_track).chain(cameras.map(bearings::camera_prior)).collect()
+        let cameras = self.courses + self.found.len()..self.count;
+        self.found.iter().flat_map(of_track).chain(cameras.map(bearings::camera_prior)).collect()
     }
 
     /// Mean deviation of the positions of `rows`, on either axis.

@@ -264,3 +264,35 @@ fn points_take_off_more_than_motion_and_nothing_where_the_camera_looks_elsewhere
     let [by_motion, by_points] = sums;
     assert!(by_points < 0.85 * by_motion, "{by_points} of {by_motion}");
 }
+
+#[test]
+fn the_truth_solves_the_vehicle_equations() {
+    // Straight on at a constant speed; receiver and yaw err from frame to frame.
+    let error_m = |i: usize| [0.3 * (0.7 * i as f64).sin(), 0.2 * (1.1 * i as f64).cos()];
+    let yaw_rad = |i: usize| 0.01 * (1.9 * i as f64).sin();
+    let track = Track {
+        positions_m: (0..40).map(|i| [1.5 * i as f64 + error_m(i)[0], error_m(i)[1]]).collect(),
+        course_rad: (0..40).map(yaw_rad).collect(),
+        time_s: (0..40).map(f64::from).collect(),
+        noise: motion::TrackNoise {
+            receiver_std_m: 0.6,
+            receiver_time_s: 20.0,
+            speed_change_std_mps: 0.5,
+            yaw_std_rad: 0.01,
+        },
+    };
+    const COURSE: usize = 40;
+    let unknowns = Unknowns { first: 0, a_frame: 3, has_yaw: true, course: 3 * COURSE };
+    let truth = |at: usize| match (at / 3, at % 3) {
+        (COURSE, _) => 0.0,
+        (row, axis @ 0..2) => error_m(row)[axis],
+        (row, _) => yaw_rad(row),
+    };
+    let equations = track.vehicle_equations(unknowns, 1.0);
+    assert_eq!(equations.len(), 1 + 39 + 38);
+    for equation in &equations {
+        let left: f64 = equation.terms.iter().map(|&(at, coefficient)| coefficient * truth(at)).sum();
+        // Of second order: the yaw's error times that of a step.
+        assert!((left - equation.right).abs() < 0.006, "{left} {}", equation.right);
+    }
+}
