@@ -118,7 +118,7 @@ def install(machine: Machine, package: Path) -> None:
     groups = set(machine.sh("id -nG omniloc").split())
     check(groups == {"omniloc", "video", "dialout", "gpio"}, f"the user's groups: {groups}")
     # An emulated processor encodes no 30 frames of 1280 x 720 a second.
-    settings = {"width_px": 320, "height_px": 180, "frame_rate_hz": 10, "port": '"/dev/ttyUSB0"'}
+    settings = {"width_px": 320, "height_px": 180, "frame_rate_hz": 10, "device": f'"{CAMERA}"', "port": '"/dev/ttyUSB0"'}
     configure(machine, RECORD_CONFIG, settings)
 
 
