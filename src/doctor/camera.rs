@@ -2,7 +2,7 @@
 
 use std::{path::Path, sync::Arc, time::Duration};
 
-use super::{Finding, advice, look_at};
+use super::{Finding, advice, fault, look_at};
 use crate::{
     calibrate::{DonutFinder, Verdict as DonutVerdict},
     config::Camera,
@@ -84,7 +84,7 @@ pub fn findings(look: &Look, chosen: &Camera, calibration: Option<&DonutCalibrat
     let mut findings = Vec::new();
     if let Some(error) = &look.error {
         let list = Path::new("/dev/v4l/by-id");
-        findings.push(Finding::problem("camera", error.to_string(), advice(error, "device", list)));
+        findings.push(Finding::problem("camera", fault(error), advice(error, "device", list)));
     }
     let Some(facts) = &look.facts else {
         if findings.is_empty() {

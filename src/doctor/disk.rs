@@ -24,14 +24,9 @@ const LEAST_HOURS: f64 = 1.0;
 const LONG: Duration = Duration::from_secs(1);
 
 pub fn examine(settings: &Settings, bytes_per_s: Option<f64>) -> Vec<Finding> {
-    let folder = &settings.folder;
     let bytes_per_s = bytes_per_s.unwrap_or(BYTES_PER_S);
-    let found = |error: &io::Error| format!("{}: {error}", folder.display());
-    if let Err(error) = std::fs::create_dir_all(folder) {
-        let advice =
-            "make it, or name another `folder` in [recorder]; for the services: systemctl edit, ReadWritePaths=";
-        return vec![Finding::problem("disk", found(&error), advice)];
-    }
+    let found = |error: &io::Error| format!("{}: {error}", settings.folder.display());
+    let folder = existing(&settings.folder);
     let space = match statvfs(folder) {
         Ok(space) => self::space(settings, &space, bytes_per_s),
         Err(error) => Finding::problem("disk", found(&error.into()), "check the file system"),
@@ -40,11 +35,18 @@ pub fn examine(settings: &Settings, bytes_per_s: Option<f64>) -> Vec<Finding> {
     let writes = match measure(folder, piece) {
         Ok(waits) => stalls(&waits, piece, bytes_per_s),
         Err(error) => {
-            let advice = "this user must be able to write there: sudo chown, or another `folder` in [recorder]";
+            let advice = "this user must be able to write there: sudo chown, or another `folder` in [recorder]; for the \
+                          services: systemctl edit, ReadWritePaths=";
             Finding::problem("disk writes", found(&error), advice)
         }
     };
     vec![space, writes]
+}
+
+/// The folder, or the one in which recording will make it.
+fn existing(folder: &Path) -> &Path {
+    let found = folder.ancestors().find(|path| path.exists()).unwrap_or(folder);
+    if found.as_os_str().is_empty() { Path::new(".") } else { found }
 }
 
 fn space(settings: &Settings, space: &StatVfs, bytes_per_s: f64) -> Finding {
@@ -136,8 +138,14 @@ mod tests {
         let file = folder.path().join("file");
         std::fs::write(&file, "no folder").expect("writes");
         let findings = examine(&Settings::new(file.join("recordings")), None);
-        assert_eq!((findings.len(), findings[0].verdict), (1, Verdict::Problem));
-        let findings = examine(&Settings::new(folder.path().join("recordings")), Some(1e5));
+        assert_eq!((findings[1].check, findings[1].verdict), ("disk writes", Verdict::Problem));
+    }
+
+    #[test]
+    fn a_folder_that_is_not_there_is_not_made() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let findings = examine(&Settings::new(folder.path().join("new/recordings")), Some(1e5));
         assert_eq!(findings.iter().map(|finding| finding.check).collect::<Vec<_>>(), ["disk", "disk writes"]);
+        assert!(!folder.path().join("new").exists());
     }
 }

@@ -6,6 +6,7 @@
 mod camera;
 mod computer;
 mod disk;
+mod pins;
 mod receiver;
 
 use std::{
@@ -20,7 +21,10 @@ use serde::Serialize;
 
 use crate::{
     config::{Camera, Gnss, LocalizeConfig, RecordConfig},
-    devices::{DeviceError, Stop},
+    devices::{
+        DeviceError, Stop,
+        gpio::{self, Led},
+    },
     map::OpenMap,
     runtime::{
         drive::{self, SIMULATED_START},
@@ -132,6 +136,12 @@ pub fn examine(purpose: &Purpose, mut each: impl FnMut(Finding)) -> anyhow::Resu
                 }
             }
         }
+        if config.gpio.driver != gpio::Driver::None
+            && let Some(pins) =
+                drive::pins(config, simulation.as_ref().map(|(simulation, _)| simulation), &Led::default())?
+        {
+            tell(pins::findings(&pins::Look::at(pins, &clock), &config.gpio));
+        }
     }
     let recorder = match purpose {
         Purpose::Record(config) => Some(&config.recorder),
@@ -194,6 +204,14 @@ fn look_at<Event: Send + 'static>(
     match thread.is_finished() {
         true => thread.join().unwrap_or(Ok(())),
         false => Err(DeviceError::TimedOut { device: "the driver".into(), silence_s: STOP_LIMIT.as_secs_f64() }),
+    }
+}
+
+/// What a device that fails says of itself, without what [`advice`] has.
+fn fault(error: &DeviceError) -> String {
+    match error {
+        DeviceError::NotPermitted { device, .. } => format!("{device} may not be opened"),
+        error => error.to_string(),
     }
 }
 

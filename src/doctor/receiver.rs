@@ -2,7 +2,7 @@
 
 use std::{path::Path, sync::Arc, time::Duration};
 
-use super::{Finding, advice, look_at};
+use super::{Finding, advice, fault, look_at};
 use crate::{
     devices::{DeviceError, SerialEvent},
     gnss::{DecoderCounters, DecoderSettings, GnssDecoder},
@@ -92,7 +92,7 @@ pub fn findings(look: &Look, port: Option<&Path>) -> Vec<Finding> {
     let mut findings = Vec::new();
     if let Some(error) = &look.error {
         let list = Path::new("/dev/serial/by-id");
-        findings.push(Finding::problem("receiver", error.to_string(), advice(error, "port", list)));
+        findings.push(Finding::problem("receiver", fault(error), advice(error, "port", list)));
     }
     let Some((opened, baud)) = &look.opened else {
         if findings.is_empty() {

@@ -263,7 +263,7 @@ fn play(
 }
 
 /// The pins; simulated and replayed pulses need no configuration.
-fn pins(
+pub fn pins(
     config: &RecordConfig,
     simulation: Option<&Simulation>,
     led: &Led,

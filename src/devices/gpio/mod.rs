@@ -66,7 +66,8 @@ const LAST_PIN: u8 = 27;
 const MAX_DEBOUNCE_MS: u64 = 1000;
 
 impl Settings {
-    fn pins(&self) -> [(&'static str, Option<u8>); 3] {
+    /// The keys of the three pins, and which they are.
+    pub fn pins(&self) -> [(&'static str, Option<u8>); 3] {
         [
             ("record_button_pin", self.record_button_pin),
             ("status_led_pin", self.status_led_pin),
