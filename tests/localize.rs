@@ -162,7 +162,7 @@ fn what_cannot_be_localized_with_is_refused_in_words() {
         (output.status.code(), stderr(&output))
     };
     let missing = run(&folder.path().join("none.map"), "duration_s = 2.0");
-    assert!(missing.0 == Some(1) && missing.1.contains("none.map"), "{missing:?}");
+    assert!(missing.0 == Some(2) && missing.1.contains("none.map"), "{missing:?}");
 
     let cut = folder.path().join("cut.map");
     let bytes = fs::read(map()).expect("readable");

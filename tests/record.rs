@@ -322,6 +322,12 @@ fn a_wrong_configuration_is_the_callers_mistake() {
     assert!(stderr(&output).contains("drive.toml:"), "{}", stderr(&output));
     assert!(!folder.path().join("recordings").exists(), "nothing was begun");
 
+    let config = configure(folder.path(), "duration_s = 600.0", &[]);
+    let text = fs::read_to_string(&config).expect("readable");
+    fs::write(&config, text.replace("\"test car\"", "\"test car\"\ncalibration = \"none.json\"")).expect("writes");
+    let output = wait(start(&config));
+    assert!(output.status.code() == Some(2) && stderr(&output).contains("none.json"), "{}", stderr(&output));
+
     let mut check = common::omniloc();
     let config = configure(folder.path(), "duration_s = 600.0", &[]);
     let (code, resolved, _) = common::run(check.arg("record").arg("--check").arg("--config").arg(&config));

@@ -2,7 +2,7 @@
 
 use std::{path::PathBuf, process::ExitCode};
 
-use super::{BadArgument, DATA_LOST, DONE, journal, print};
+use super::{BadArgument, DATA_LOST, DONE, journal, options::check_input, print};
 use crate::{
     config::LocalizeConfig,
     localize::Stage,
@@ -38,6 +38,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.check {
         return Ok(DONE.into());
     }
+    check_input(&config.map.file).map_err(|BadArgument(what)| wrong(format!("map.file: {what}")))?;
     journal::start();
     let outcome = live::localize(&config, |status| journal::show_status(line(status)));
     journal::finish();

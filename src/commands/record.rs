@@ -34,6 +34,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.check {
         return Ok(DONE.into());
     }
+    if let Some(calibration) = &config.vehicle.calibration {
+        drive::read_calibration(calibration).map_err(|error| wrong(format!("vehicle.calibration: {error:#}")))?;
+    }
     journal::start();
     let outcome = drive::record(&config, |status| journal::show_status(line(status)));
     journal::finish();
