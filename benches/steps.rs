@@ -222,7 +222,7 @@ fn matching(c: &mut Criterion) {
             b.iter(|| {
                 log_likelihood.fill(0.0);
                 let features = query.next().expect("they go round");
-                field.add_log_likelihood(features, NoiseModel::Gaussian, 1.0, &mut scratch, &mut log_likelihood);
+                field.add_log_likelihood(features, NoiseModel::Gaussian, &mut scratch, &mut log_likelihood);
                 most_likely_cell(&log_likelihood)
             });
         });

@@ -20,3 +20,12 @@ fn every_kept_input_holds() {
         }
     }
 }
+
+/// A map of an earlier format is refused at its version, and nothing behind that is tried.
+#[test]
+fn the_kept_map_is_one_of_the_present_format() {
+    let input = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/inputs/map/sp-of-a-corridor");
+    omniloc::map::file::from_bytes(&fs::read(input).expect("readable")).expect(
+        "make it anew: simulate a corridor of 12 frames of 320x240, train --recipe paper --features sp --select none",
+    );
+}

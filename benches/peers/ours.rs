@@ -143,7 +143,7 @@ fn match_frames(directory: &Path) -> Result<Value, Box<dyn Error>> {
         .chunks_exact(features)
         .map(|query| {
             log_likelihood.fill(0.0);
-            field.add_log_likelihood(query, NoiseModel::Gaussian, 1.0, &mut scratch, &mut log_likelihood);
+            field.add_log_likelihood(query, NoiseModel::Gaussian, &mut scratch, &mut log_likelihood);
             most_likely_cell(&log_likelihood)
         })
         .collect();

@@ -249,7 +249,6 @@ pub(super) fn chosen_on(selection: Selection) -> Option<&'static str> {
     match selection {
         Selection::None => None,
         Selection::Backward => Some("validation"),
-        Selection::Folded => Some("folds"),
     }
 }
 

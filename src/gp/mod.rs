@@ -62,13 +62,6 @@ impl LearningPositions {
         Self { positions, recordings: recordings.to_vec(), squared_distance_m2, spacing_m }
     }
 
-    /// Some of the positions, with the spacing of all.
-    pub fn of_rows(&self, rows: &[usize]) -> Self {
-        let positions = rows.iter().map(|&row| self.positions[row]).collect();
-        let recordings: Vec<usize> = rows.iter().map(|&row| self.recordings[row]).collect();
-        Self { spacing_m: self.spacing_m, ..Self::of_recordings(positions, &recordings) }
-    }
-
     /// Number of the recording each position is from.
     pub fn recordings(&self) -> &[usize] {
         &self.recordings

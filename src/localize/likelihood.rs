@@ -72,7 +72,7 @@ impl FieldOnCells {
         &self.mean[feature * self.cells..(feature + 1) * self.cells]
     }
 
-    /// Adds `weight` × the log-likelihood of `features` at every cell to `log_likelihood`. `scratch` is overwritten.
+    /// Adds the log-likelihood of `features` at every cell to `log_likelihood`. `scratch` is overwritten.
     ///
     /// # Panics
     /// When `features` or `log_likelihood` is of another length than the field.
@@ -80,7 +80,6 @@ impl FieldOnCells {
         &self,
         features: &[f32],
         noise: NoiseModel,
-        weight: f32,
         scratch: &mut Vec<f32>,
         log_likelihood: &mut [f32],
     ) {
@@ -101,13 +100,12 @@ impl FieldOnCells {
         }
         let count = self.features as f32;
         for ((out, residual), normalizer) in log_likelihood.iter_mut().zip(&*scratch).zip(&self.log_normalizer) {
-            *out += weight
-                * match noise {
-                    NoiseModel::Gaussian => normalizer - 0.5 * residual,
-                    NoiseModel::UnknownScale => {
-                        0.5 * normalizer - 0.5 * count * libm::logf(residual.max(f32::MIN_POSITIVE))
-                    }
-                };
+            *out += match noise {
+                NoiseModel::Gaussian => normalizer - 0.5 * residual,
+                NoiseModel::UnknownScale => {
+                    0.5 * normalizer - 0.5 * count * libm::logf(residual.max(f32::MIN_POSITIVE))
+                }
+            };
         }
     }
 
@@ -140,7 +138,7 @@ pub fn log_likelihood_nowhere(features: &[f32], noise: NoiseModel) -> Option<f32
 /// The fields of a map's groups on the same cells, each with what it counts.
 #[derive(Debug, Clone)]
 pub struct MapFields {
-    groups: Vec<(FieldOnCells, NoiseModel, f32)>,
+    groups: Vec<(FieldOnCells, NoiseModel)>,
 }
 
 impl MapFields {
@@ -149,7 +147,7 @@ impl MapFields {
         let of_group = |(info, field): (&GroupInfo, GroupField)| {
             let GroupField { mean, variance } = field;
             let field = FieldOnCells::new(info.features, cells, mean, &variance);
-            (field, info.recipe.noise, info.recipe.weight as f32)
+            (field, info.recipe.noise)
         };
         Self { groups: groups.iter().zip(fields).map(of_group).collect() }
     }
@@ -168,10 +166,10 @@ impl MapFields {
     /// When `features` or `log_likelihood` is of another length than the fields.
     pub fn add_log_likelihood(&self, features: &[f32], scratch: &mut Vec<f32>, log_likelihood: &mut [f32]) {
         let mut rest = features;
-        for (field, noise, weight) in &self.groups {
+        for (field, noise) in &self.groups {
             let of_group;
             (of_group, rest) = rest.split_at(field.features());
-            field.add_log_likelihood(of_group, *noise, *weight, scratch, log_likelihood);
+            field.add_log_likelihood(of_group, *noise, scratch, log_likelihood);
         }
     }
 
@@ -183,11 +181,11 @@ impl MapFields {
         scratch: &mut Vec<f32>,
         log_likelihood: &mut [f32],
     ) {
-        let before: usize = self.groups[..group].iter().map(|(field, ..)| field.features()).sum();
-        let (field, noise, weight) = &self.groups[group];
+        let before: usize = self.groups[..group].iter().map(|(field, _)| field.features()).sum();
+        let (field, noise) = &self.groups[group];
         log_likelihood.fill(0.0);
         let features = &features[before..before + field.features()];
-        field.add_log_likelihood(features, *noise, *weight, scratch, log_likelihood);
+        field.add_log_likelihood(features, *noise, scratch, log_likelihood);
     }
 
     /// The log-likelihood of a frame's features at no place, which all cells' are compared with; `None` where a group's
@@ -197,7 +195,7 @@ impl MapFields {
         groups.iter().try_fold(0.0, |sum, group| {
             let of_group;
             (of_group, rest) = rest.split_at(group.features);
-            Some(sum + group.recipe.weight as f32 * log_likelihood_nowhere(of_group, group.recipe.noise)?)
+            Some(sum + log_likelihood_nowhere(of_group, group.recipe.noise)?)
         })
     }
 }
@@ -244,7 +242,7 @@ mod tests {
     #[test]
     fn the_sum_equals_the_sum_of_each() {
         let (features, mut sum, mut scratch) = ([0.3, -0.7], vec![0.0; 3], Vec::new());
-        field().add_log_likelihood(&features, NoiseModel::Gaussian, 1.0, &mut scratch, &mut sum);
+        field().add_log_likelihood(&features, NoiseModel::Gaussian, &mut scratch, &mut sum);
         let each = field().log_likelihood_of_each(&features);
         for (cell, sum) in sum.iter().enumerate() {
             assert!((sum - each[cell] - each[3 + cell]).abs() < 1e-6);
@@ -258,8 +256,8 @@ mod tests {
         let repeated = FieldOnCells::new(2, 3, mean, &[0.5, 1.0, 2.0, 0.5, 1.0, 2.0]);
         for noise in [NoiseModel::Gaussian, NoiseModel::UnknownScale] {
             let (mut a, mut b, mut scratch) = (vec![0.0; 3], vec![0.0; 3], Vec::new());
-            shared.add_log_likelihood(&[0.3, -0.7], noise, 0.5, &mut scratch, &mut a);
-            repeated.add_log_likelihood(&[0.3, -0.7], noise, 0.5, &mut scratch, &mut b);
+            shared.add_log_likelihood(&[0.3, -0.7], noise, &mut scratch, &mut a);
+            repeated.add_log_likelihood(&[0.3, -0.7], noise, &mut scratch, &mut b);
             for (a, b) in a.iter().zip(&b) {
                 assert!((a - b).abs() < 1e-6);
             }
@@ -271,7 +269,7 @@ mod tests {
     fn unknown_scale_is_the_profile_of_noise_of_the_frame_and_the_map_s_log_variance() {
         let features = [0.3_f32, -0.7];
         let (mut profile, mut scratch) = (vec![0.0; 3], Vec::new());
-        field().add_log_likelihood(&features, NoiseModel::UnknownScale, 1.0, &mut scratch, &mut profile);
+        field().add_log_likelihood(&features, NoiseModel::UnknownScale, &mut scratch, &mut profile);
         let unit = |scale: f32| FieldOnCells::new(2, 3, vec![0.0, 1.0, 2.0, -1.0, 0.5, 0.25], &[scale; 3]);
         let best = |cell: usize| {
             (1..4000)
@@ -295,7 +293,7 @@ mod tests {
         let field = FieldOnCells::new(2, 2, vec![1.0, 0.0, 1.0, 0.0], &[1.1, 9.0]);
         let (mut known_and_unknown, mut scratch) = (vec![0.0; 2], Vec::new());
         let faint = [0.4, 0.4];
-        field.add_log_likelihood(&faint, NoiseModel::UnknownScale, 1.0, &mut scratch, &mut known_and_unknown);
+        field.add_log_likelihood(&faint, NoiseModel::UnknownScale, &mut scratch, &mut known_and_unknown);
         assert!(known_and_unknown[0] > known_and_unknown[1], "{known_and_unknown:?}");
     }
 }

@@ -166,9 +166,6 @@ impl MapInfo {
                 let (features, rank, m) = (group.features, group.rank, name.dimensions());
                 return Err(format!("{name}: {features} features of rank {rank} from {m} properties"));
             }
-            if !(1e-6..=1e6).contains(&group.recipe.weight) {
-                return Err(format!("{name}: weight {:e}", group.recipe.weight));
-            }
             let fitted: Vec<Hyperparameters> = match &group.hyperparameters {
                 GroupHyperparameters::Shared(shared) => vec![*shared],
                 GroupHyperparameters::Each(fits) if fits.len() == group.features => {

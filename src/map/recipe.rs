@@ -36,8 +36,6 @@ pub enum Selection {
     None,
     /// Backward sequential elimination: the paper's.
     Backward,
-    /// The most predictable ones, as many as score best on folds of the learning images.
-    Folded,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -72,8 +70,6 @@ pub struct GroupRecipe {
     pub descriptor: Descriptor,
     pub model: Model,
     pub noise: NoiseModel,
-    /// Factor on the group's log-likelihood where groups are summed.
-    pub weight: f64,
 }
 
 /// How a descriptor becomes features and Gaussian processes.
@@ -118,7 +114,7 @@ impl Recipe {
 
     fn paper(descriptors: &[Descriptor]) -> Self {
         let model = Model::EachFeature { scaling: ScalingMethod::Whitening, bounds: Bounds::PAPER };
-        let group = |&descriptor| GroupRecipe { descriptor, model, noise: NoiseModel::Gaussian, weight: 1.0 };
+        let group = |&descriptor| GroupRecipe { descriptor, model, noise: NoiseModel::Gaussian };
         Self {
             name: RecipeName::Paper,
             groups: descriptors.iter().map(group).collect(),
@@ -134,7 +130,7 @@ impl Recipe {
             let ridge = if descriptor == Descriptor::PatchWords { 2.0 } else { 0.05 };
             let settings = NoiseWhiteningSettings { features: FEATURES_A_GROUP, length_scale_spacings: 1.5, ridge };
             let model = Model::SharedField(settings);
-            GroupRecipe { descriptor, model, noise: NoiseModel::UnknownScale, weight: 1.0 }
+            GroupRecipe { descriptor, model, noise: NoiseModel::UnknownScale }
         };
         Self {
             name: RecipeName::Default,

@@ -6,7 +6,7 @@ use crate::evaluate::{Case, FrameEntry, covariance_about, nees};
 use crate::features::Descriptor;
 use crate::gp::{GpError, Hyperparameters, LearningPositions};
 use crate::localize::{FieldOnCells, MapFields};
-use crate::map::{CandidateCells, CellsError, FeatureMap, GroupHyperparameters, NoiseModel};
+use crate::map::{CandidateCells, CellsError, FeatureMap, GroupHyperparameters};
 use crate::train::{LearnedGroup, Outcomes, Survey, Trial, credible_level, locate};
 use crate::types::{PositionCovariance, PositionM, distance_m};
 
@@ -115,10 +115,10 @@ impl Insight {
             let field = FieldOnCells::new(group.features(), cells.len(), mean, &variance);
             let properties = survey.properties(group.recipe.descriptor, &trial.split.test);
             let features = group.scaling.apply(properties.as_ref());
-            let (noise, weight): (NoiseModel, f32) = (group.recipe.noise, group.recipe.weight as f32);
+            let noise = group.recipe.noise;
             rows.par_iter_mut().enumerate().for_each_init(Vec::new, |scratch, (i, row)| {
                 let of_frame: Vec<f32> = features.row(i).iter().map(|&z| z as f32).collect();
-                field.add_log_likelihood(&of_frame, noise, weight, scratch, row);
+                field.add_log_likelihood(&of_frame, noise, scratch, row);
             });
         }
         if surfaces.is_empty() {

@@ -232,7 +232,6 @@ fn put_provenance(page: &mut String, report: &Report) {
             let selection = match info.selection {
                 Selection::None => "none",
                 Selection::Backward => "backward elimination",
-                Selection::Folded => "on folds",
             };
             *page += "<h4>The map</h4>";
             put_facts(
@@ -262,7 +261,11 @@ fn put_provenance(page: &mut String, report: &Report) {
     put_inputs(page, report);
     *page += "<h3>Settings</h3>";
     put_facts(page, &report.settings.iter().map(|(key, value)| (key.as_str(), value.clone())).collect::<Vec<_>>());
-    let _ = write!(page, "<h4>To repeat it</h4><pre>{}</pre></section>", escaped(&report.command_line()));
+    let _ = write!(
+        page,
+        "<h4>To repeat it, with --force into the same folder</h4><pre>{}</pre></section>",
+        escaped(&report.command_line())
+    );
 }
 
 fn put_inputs(page: &mut String, report: &Report) {

@@ -85,26 +85,6 @@ impl LearnedGroup {
         Self { learning, ..self.clone() }
     }
 
-    /// Leave-one-out residuals of all features, n × k.
-    pub fn leave_one_out(&self, learning: &LearningPositions) -> Result<Mat<f64>, GpError> {
-        match &self.hyperparameters {
-            GroupHyperparameters::Shared(hyperparameters) => {
-                Ok(Posterior::new(learning, self.learning.as_ref(), *hyperparameters)?.leave_one_out().0)
-            }
-            GroupHyperparameters::Each(fits) => {
-                let columns: Vec<Mat<f64>> = fits
-                    .par_iter()
-                    .enumerate()
-                    .map(|(r, fit)| {
-                        let z = self.learning.as_ref().subcols(r, 1);
-                        Ok(Posterior::new(learning, z, fit.hyperparameters)?.leave_one_out().0)
-                    })
-                    .collect::<Result<_, GpError>>()?;
-                Ok(Mat::from_fn(self.learning.nrows(), fits.len(), |i, r| columns[r][(i, 0)]))
-            }
-        }
-    }
-
     /// Number of features k.
     pub fn features(&self) -> usize {
         self.scaling.features()

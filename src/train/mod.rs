@@ -4,7 +4,6 @@
 //! processes; [`run`] carries out the paper's protocol on a [`Split`]; [`train`] makes a map of everything.
 
 mod axes;
-mod folded;
 mod group;
 pub mod noise_whitening;
 mod panoramas;
@@ -123,7 +122,7 @@ pub fn train(
         let descriptor = selected.recipe.descriptor;
         let properties = survey.properties(descriptor, &everything);
         let group = match recipe.selection {
-            Selection::Backward | Selection::Folded => selected.conditioned_on(properties.as_ref()),
+            Selection::Backward => selected.conditioned_on(properties.as_ref()),
             Selection::None => {
                 on_step(Step::Fitting { descriptor: descriptor.name(), features: descriptor.dimensions() });
                 let changes = survey.changes(descriptor, &everything);

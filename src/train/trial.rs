@@ -6,7 +6,6 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use super::folded::folded_selection;
 use super::group::{LearnError, LearnedGroup};
 use super::perturbation::standard_normal;
 use super::recognition::{self, HeldBack};
@@ -108,8 +107,6 @@ pub enum TrialError {
 
 /// Fewer learning images than this have no Gaussian process worth the name.
 const MIN_LEARNING: usize = 3;
-/// How learning images fall into folds.
-const FOLD_SEED: u64 = 0;
 /// A likelihood table larger than this is refused.
 const MAX_TABLE_BYTES: usize = 2 << 30;
 
@@ -200,7 +197,6 @@ fn run_once(
         let mut elimination = None;
         let kept = match trial.recipe.selection {
             Selection::None => (0..group.features()).collect(),
-            Selection::Folded => folded_selection(&group, &learning, &cells, FOLD_SEED)?,
             Selection::Backward => {
                 let path = queries.eliminate(&group, &field, &centers_m, on_step)?;
                 let kept = path.best_subset();
@@ -229,16 +225,15 @@ fn run_once(
             warnings: group.hyperparameters.warnings(),
             elimination,
         });
-        let weight = group_recipe.weight as f32;
         let of_group = queries.nowhere(&kept_group, &split.validation);
-        nowhere = nowhere.zip(of_group).map(|(sums, of_group): (Vec<f32>, _)| {
-            sums.iter().zip(of_group).map(|(sum, value)| sum + weight * value).collect()
-        });
+        nowhere = nowhere
+            .zip(of_group)
+            .map(|(sums, of_group): (Vec<f32>, _)| sums.iter().zip(of_group).map(|(sum, value)| sum + value).collect());
         match &mut fused {
-            None => fused = Some([all_test, kept_test, kept_validation].map(|likelihoods| likelihoods.scaled(weight))),
+            None => fused = Some([all_test, kept_test, kept_validation]),
             Some(sums) => {
                 for (sum, likelihoods) in sums.iter_mut().zip([all_test, kept_test, kept_validation]) {
-                    sum.add(&likelihoods, weight);
+                    sum.add(&likelihoods);
                 }
             }
         }
@@ -374,7 +369,7 @@ fn log_likelihoods(field: &FieldOnCells, features: &[Vec<f32>], noise: NoiseMode
         .par_iter()
         .map_init(Vec::new, |scratch, features| {
             let mut row = vec![0.0; field.cells()];
-            field.add_log_likelihood(features, noise, 1.0, scratch, &mut row);
+            field.add_log_likelihood(features, noise, scratch, &mut row);
             row
         })
         .collect();
@@ -382,14 +377,9 @@ fn log_likelihoods(field: &FieldOnCells, features: &[Vec<f32>], noise: NoiseMode
 }
 
 impl Likelihoods {
-    fn scaled(mut self, weight: f32) -> Self {
-        self.values.iter_mut().for_each(|value| *value *= weight);
-        self
-    }
-
-    fn add(&mut self, other: &Self, weight: f32) {
+    fn add(&mut self, other: &Self) {
         for (sum, value) in self.values.iter_mut().zip(&other.values) {
-            *sum += weight * value;
+            *sum += value;
         }
     }
 }

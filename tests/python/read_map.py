@@ -19,7 +19,7 @@ for name in sorted(set(tensors) - {"sha256"} - {name.removesuffix("/crc32") for 
 assert checksum.digest() == tensors["sha256"].tobytes(), "the checksum fits"
 
 info = json.loads(text)
-assert info["format_version"] == 4
+assert info["format_version"] == 5
 positions_m, cells = tensors["positions_m"], tensors["cells"]
 grid = info["grid"]
 centers_m = np.array(grid["origin_m"]) + grid["step_m"] * cells
