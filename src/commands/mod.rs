@@ -1,6 +1,7 @@
 //! The commands: one file each. Results go to stdout, diagnostics to stderr.
 
-pub mod calibrate;
+pub mod appearances;
+mod calibrate;
 pub mod check;
 pub mod completions;
 pub mod demo;

@@ -8,10 +8,10 @@ use super::BadArgument;
 use super::options::{check_input, check_not_input, with_folders};
 use super::progress::Progress;
 use crate::features::Descriptor;
-use crate::map::{PERTURBED_COPIES, Recipe};
+use crate::map::{PERTURBED_COPIES, Recipe, Smoothing};
 use crate::recording::{Recording, RecordingError};
 use crate::train::{Survey, SurveyOptions, TrialError};
-use crate::types::{NS_PER_S, PositionM, counted, distance_m};
+use crate::types::{PositionM, counted, distance_m};
 
 /// Learning takes time with the third power of the number of frames: more than this many are thinned out.
 const MAX_FRAMES: usize = 800;
@@ -77,25 +77,6 @@ fn refuse_copies(recordings: &[Recording]) -> Result<(), BadArgument> {
     Ok(())
 }
 
-/// How many times the recordings saw their place: those that began within [`ONE_APPEARANCE_S`] of another are one with it.
-/// A recording that does not know the date counts by itself.
-pub fn appearances(recordings: &[Recording]) -> usize {
-    let began_ns = |recording: &Recording| recording.topics.values().map(|summary| summary.first_ns).min().unwrap_or(0);
-    appearances_begun(&recordings.iter().map(began_ns).collect::<Vec<_>>())
-}
-
-fn appearances_begun(log_times_ns: &[u64]) -> usize {
-    // Log times before this count from when the computer was switched on, or from the first image: 2001-09-09.
-    const FIRST_DATE_NS: u64 = 1_000_000_000 * NS_PER_S;
-    let mut dates_ns: Vec<u64> = log_times_ns.iter().copied().filter(|&ns| ns > FIRST_DATE_NS).collect();
-    dates_ns.sort_unstable();
-    let repeated = dates_ns.windows(2).filter(|pair| pair[1] - pair[0] < ONE_APPEARANCE_S * NS_PER_S).count();
-    log_times_ns.len() - repeated
-}
-
-/// The light changes, and traffic and parked cars are others \[s\].
-const ONE_APPEARANCE_S: u64 = 3 * 3600;
-
 fn open_all(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
     for (i, path) in paths.iter().enumerate() {
         check_not_input(path, &paths[..i]).map_err(|_| BadArgument(format!("{} is named twice", path.display())))?;
@@ -128,17 +109,26 @@ fn open_all(paths: &[PathBuf]) -> anyhow::Result<Vec<Recording>> {
     }
 }
 
-/// Reads what learning by `recipes` needs of all frames.
+/// Reads what learning by `recipes` needs of all frames, with what `smoothing` needs, if not that of each recipe.
 pub fn read_to_learn(
     recordings: &[Recording],
     recipes: &[Recipe],
+    smoothing: Option<Smoothing>,
     fixed: bool,
     progress: &Progress,
 ) -> anyhow::Result<Survey> {
-    let descriptors = recipes.iter().flat_map(Recipe::descriptors).collect();
-    let perturbed = recipes.iter().flat_map(Recipe::perturbed).collect();
-    // A panorama that is turned by its yaw says nothing of the heading.
-    read(recordings, descriptors, perturbed, fixed, !fixed, progress)
+    let smooths = |recipe: &Recipe| smoothing.unwrap_or(Smoothing::usual(recipe.name)) == Smoothing::Track;
+    let options = SurveyOptions {
+        descriptors: recipes.iter().flat_map(Recipe::descriptors).collect(),
+        perturbed: recipes.iter().flat_map(Recipe::perturbed).collect(),
+        fixed,
+        // A panorama that is turned by its yaw says nothing of the heading.
+        compass: !fixed,
+        follow: !fixed && recipes.iter().any(smooths),
+        repetitions: PERTURBED_COPIES,
+        seed: 0,
+    };
+    read(recordings, options, progress)
 }
 
 /// Reads what matching all frames against a map with these `descriptors` needs.
@@ -147,25 +137,23 @@ pub fn read_to_match(
     descriptors: Vec<Descriptor>,
     progress: &Progress,
 ) -> anyhow::Result<Survey> {
-    read(std::slice::from_ref(recording), descriptors, Vec::new(), false, true, progress)
+    let options = SurveyOptions {
+        descriptors,
+        perturbed: Vec::new(),
+        fixed: false,
+        compass: true,
+        follow: false,
+        repetitions: 0,
+        seed: 0,
+    };
+    read(std::slice::from_ref(recording), options, progress)
 }
 
-fn read(
-    recordings: &[Recording],
-    mut descriptors: Vec<Descriptor>,
-    perturbed: Vec<Descriptor>,
-    fixed: bool,
-    compass: bool,
-    progress: &Progress,
-) -> anyhow::Result<Survey> {
-    descriptors.sort_unstable();
-    descriptors.dedup();
-    // Only for learning by a recipe that corrects positions.
-    let follow = !fixed && !perturbed.is_empty();
-    let options =
-        SurveyOptions { descriptors, fixed, compass, follow, repetitions: PERTURBED_COPIES, perturbed, seed: 0 };
+fn read(recordings: &[Recording], mut options: SurveyOptions, progress: &Progress) -> anyhow::Result<Survey> {
+    options.descriptors.sort_unstable();
+    options.descriptors.dedup();
     let frames = recordings.iter().map(|recording| recording.survey.len()).sum();
-    progress.begin(if fixed { "reading frames, turned by their yaw" } else { "reading frames" }, frames);
+    progress.begin(if options.fixed { "reading frames, turned by their yaw" } else { "reading frames" }, frames);
     Ok(Survey::read(recordings, &options, |frames| progress.advance(frames))?)
 }
 
@@ -245,25 +233,4 @@ pub fn elsewhere(path: &std::path::Path, truth_m: &[PositionM], survey: &Survey)
             path.display()
         )
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn laps_of_one_hour_are_one_appearance_and_unknown_dates_count_each() {
-        const HOUR_NS: u64 = 3600 * NS_PER_S;
-        let noon = 1_750_000_000 * NS_PER_S;
-        let table: [(&[u64], usize); 5] = [
-            (&[noon], 1),
-            (&[noon, noon + HOUR_NS / 2, noon + HOUR_NS], 1),
-            (&[noon + 8 * HOUR_NS, noon], 2),
-            (&[noon, noon + 24 * HOUR_NS, noon + 25 * HOUR_NS], 2),
-            (&[0, 0], 2),
-        ];
-        for (log_times_ns, expected) in table {
-            assert_eq!(appearances_begun(log_times_ns), expected, "{log_times_ns:?}");
-        }
-    }
 }

@@ -5,13 +5,13 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 
+use super::appearances::share_seen_once;
 use super::evaluate_map::open_map;
 use super::map_report;
 use super::options::{OutputKind, check_input, check_not_input, check_output};
 use super::progress::Progress;
 use super::survey::{
-    appearances, bad_argument, in_one_place, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn,
-    read_to_match,
+    bad_argument, in_one_place, open_recordings, parse_descriptor, parse_spacing_m, read_to_learn, read_to_match,
 };
 use super::{BadArgument, DONE, print};
 use crate::features::Descriptor;
@@ -78,6 +78,9 @@ pub struct Args {
 /// A map of less skill than this is warned about.
 const MIN_SKILL: f64 = 0.5;
 
+/// A map of which a larger share was seen in one appearance only is warned about.
+const MANY_SEEN_ONCE: f64 = 0.1;
+
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     check_output(&args.out, OutputKind::File, args.force)?;
     check_not_input(&args.out, &args.recordings)?;
@@ -91,13 +94,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let recordings = in_one_place(open_recordings(&args.recordings, args.spacing_m)?)?;
     let progress = Progress::new();
-    let survey = read_to_learn(&recordings, std::slice::from_ref(&recipe), false, &progress)?;
+    let smoothing = args.smooth.unwrap_or(Smoothing::usual(args.recipe));
+    let survey = read_to_learn(&recordings, std::slice::from_ref(&recipe), Some(smoothing), false, &progress)?;
     let settings = TrainSettings {
         split: args.split,
         seed: args.seed,
         grid_step_m: args.grid_step_m.unwrap_or_else(|| Grid::usual_step_m(&survey.positions_m())),
         within_m: args.within_m,
-        smoothing: args.smooth.unwrap_or(Smoothing::usual(args.recipe)),
+        smoothing,
     };
     let sources: Vec<String> = recordings.iter().map(|recording| recording.name.clone()).collect();
     let map =
@@ -105,9 +109,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let bytes = file::to_bytes(&map);
     write_bytes_atomically(&args.out, &bytes)?;
     progress.finish();
-    if appearances(&recordings) < 2 {
+    let seen_once = share_seen_once(&recordings);
+    if seen_once > MANY_SEEN_ONCE {
+        let place = match seen_once {
+            1.0 => "its place".into(),
+            share => format!("{:.0} % of its place", 100.0 * share),
+        };
         eprintln!(
-            "warning: the map has seen its place only once: in other light or after a change it will err more; record it \
+            "warning: the map has seen {place} only once: in other light or after a change it will err more there; record it \
              again on another day and name all recordings"
         );
     }

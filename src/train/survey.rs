@@ -56,7 +56,7 @@ pub struct SurveyOptions {
     pub fixed: bool,
     /// Compass signatures too.
     pub compass: bool,
-    /// Points of the scene are followed from frame to frame, where frames have a yaw.
+    /// Points of the scene are followed from frame to frame, where all frames of a recording have a yaw and a time.
     pub follow: bool,
     /// Perturbed copies of every frame, for the descriptors in `perturbed`.
     pub repetitions: usize,
@@ -146,8 +146,9 @@ impl Survey {
         let describe = |describer: &mut Describer, i: usize, panorama: &Panorama| {
             describe_frame(describer, panorama, options, (first + i) as u64)
         };
-        let has_yaw = recording.survey.iter().all(|frame| frame.yaw_rad.is_some());
-        let mut follower = (options.follow && has_yaw).then(|| PointFollower::new(self.calibration.azimuth));
+        let is_track = |frame: &SurveyFrame| frame.yaw_rad.is_some() && frame.known_time_s().is_some();
+        let mut follower = (options.follow && recording.survey.iter().all(is_track))
+            .then(|| PointFollower::new(self.calibration.azimuth));
         let mut sightings: Vec<Vec<Sighting>> = Vec::new();
         let take = |frame: SurveyFrame, DescribedFrame { properties, compass, wide }| {
             if let (Some(follower), Some(yaw_rad)) = (&mut follower, frame.yaw_rad) {
