@@ -111,7 +111,7 @@ pub struct Args {
     pub frames: bool,
     /// Write a page with figures and tables into this folder, with the figures as SVG and PNG and every number that is
     /// drawn as JSON
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", hide = cfg!(not(feature = "report")))]
     pub report: Option<PathBuf>,
     /// Replace the JSON file or the report if it exists
     #[arg(long)]
@@ -301,7 +301,7 @@ fn protocol(
         .collect();
     let recording_of = std::slice::from_ref(recording);
     let read_all = |fixed: bool| -> anyhow::Result<(Survey, Views)> {
-        let survey = read_to_learn(recording_of, &recipes, fixed, progress)?;
+        let survey = read_to_learn(recording_of, &recipes, args.smooth, fixed, progress)?;
         Ok((survey, read_views(&[recording], args, fixed, progress)?))
     };
     let (plain, plain_views) = read_all(false)?;

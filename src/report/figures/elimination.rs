@@ -15,7 +15,7 @@ pub fn elimination(dataset: &Dataset) -> Drawn {
     let Some(first) = dataset.eliminations.first() else {
         let why = match &dataset.map {
             Some(_) => {
-                "A map holds the features that were kept, not how the others were removed: `evaluate` without --map \
+                "A map holds the features that were kept, not how the others were removed: omniloc evaluate without --map \
                         shows that."
             }
             None => "No recipe that was run removes features one by one.",

@@ -18,7 +18,7 @@ const WIDE_PX: f64 = 1136.0;
 pub fn timeline(dataset: &Dataset) -> Drawn {
     const TITLE: &str = "The drive, second by second";
     if dataset.map.is_none() {
-        let why = "Test frames of a split are not consecutive. `evaluate --map` takes a whole drive, frame after frame, as \
+        let why = "Test frames of a split are not consecutive. omniloc evaluate --map takes a whole drive, frame after frame, as \
                    the vehicle does.";
         return Drawn::left_out(TITLE, why);
     }
