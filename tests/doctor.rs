@@ -51,6 +51,18 @@ fn a_receiver_that_says_nothing_is_a_problem_with_advice() {
     assert!(said.ends_with("so this cannot record\n"), "{said}");
 }
 
+/// What runs the tests is no Raspberry Pi.
+#[test]
+fn pins_that_are_asked_for_and_not_there_are_a_problem() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let config = configure(folder.path(), "duration_s = 60.0", &[]);
+    let text = fs::read_to_string(&config).expect("readable");
+    fs::write(&config, format!("{text}[gpio]\ndriver = \"rppal\"\nrecord_button_pin = 17\n")).expect("writes");
+    let output = doctor(&config, &["--json"]);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    assert!(findings(&output).contains(&("pins".into(), "problem".into())), "{output:?}");
+}
+
 #[test]
 fn a_map_that_is_missing_is_a_problem() {
     let folder = tempfile::tempdir().expect("a temporary folder");
