@@ -49,6 +49,8 @@ pub struct Tracker {
     cells: CandidateCells,
     refine: bool,
     temperature: f64,
+    /// What the variance of a sighting is multiplied by: the map's gaps are narrower than those the temperature is of.
+    narrower: f64,
     /// Variance on either axis that the positions of the map itself have.
     map_variance_m2: f64,
     compass: Option<Compass>,
@@ -101,6 +103,7 @@ impl Tracker {
             cells: cells.clone(),
             refine: info.refine,
             temperature: info.temperature,
+            narrower: info.gap_ratio.powi(-2),
             map_variance_m2: info.position_std_m().powi(2),
             compass,
             belief: Belief::uniform(cells),
@@ -214,7 +217,7 @@ impl Tracker {
     pub(super) fn sighting(&self, position_m: PositionM, log_likelihood: &[f32]) -> Mode {
         let hill = self.belief.seen_near(position_m, (1.0 / self.last_share) as f32);
         let summit_m = if self.refine { summit_near(&self.cells, log_likelihood, hill.mean_m) } else { None };
-        Mode { mean_m: summit_m.unwrap_or(hill.mean_m), ..hill }
+        Mode { mean_m: summit_m.unwrap_or(hill.mean_m), covariance: hill.covariance.scaled(self.narrower), ..hill }
     }
 
     /// Moves the belief to the time of a frame, before what that frame says; within `reach`, if pictures show one.

@@ -78,6 +78,9 @@ pub struct MapInfo {
     /// p(cell) ∝ exp(log-likelihood / temperature): learned from frames that were held back, whole recordings of them
     /// where there are several.
     pub temperature: f64,
+    /// How many times as wide as the map's own the gaps between learning images were in which the temperature was learned.
+    /// Errors grow with them: the variance of what a frame says of its place is divided by the square.
+    pub gap_ratio: f64,
     /// Frames that resemble their best cell less than this for a while are of no place in the map: how much likelier it is
     /// than no place, in nats at the map's temperature. `None` where the map cannot tell.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -156,6 +159,9 @@ impl MapInfo {
         }
         if !(1e-3..=1e6).contains(&self.temperature) {
             return Err(format!("temperature {:e}", self.temperature));
+        }
+        if !(1e-2..=1e2).contains(&self.gap_ratio) {
+            return Err(format!("a ratio of gaps of {:e}", self.gap_ratio));
         }
         for (i, group) in self.groups.iter().enumerate() {
             let name = group.recipe.descriptor;
@@ -269,6 +275,7 @@ pub(crate) mod tests {
                     hyperparameters: GroupHyperparameters::Shared(hyperparameters),
                 }],
                 temperature: 4.0,
+                gap_ratio: 1.0,
                 least_resemblance: Some(-12.0),
                 heading_std_rad: Some(0.02),
                 validation: Vec::new(),

@@ -134,12 +134,15 @@ pub fn update(
     let truth_m: Vec<PositionM> = of_drive.iter().map(|&i| joined.positions_m[tests[i]]).collect();
     let remaining_std_m = track.and_then(|track| track.remaining_std_m()).unwrap_or(0.0);
     let std_m = vec![remaining_std_m; of_drive.len()];
-    let temperature = fit_temperature(&cells, &rows, &truth_m, &std_m).unwrap_or(map.info.temperature);
-    let temperature = temperature.max(map.info.temperature);
+    let (temperature, gap_ratio) = match fit_temperature(&cells, &rows, &truth_m, &std_m) {
+        Some(found) => more_cautious(&map.info, found),
+        None => (map.info.temperature, map.info.gap_ratio),
+    };
     let compass = joined.compass(map, survey, &positions_m);
     let info = MapInfo {
         grid: cells.grid,
         temperature,
+        gap_ratio,
         least_resemblance: map.info.least_resemblance.map(|least| least * map.info.temperature / temperature),
         heading_std_rad: compass.as_ref().map(|compass| compass.std_rad),
         recordings: [map.info.recordings.clone(), vec![TrainedOn { name: name.into(), frames: survey.len(), track }]]
@@ -149,6 +152,14 @@ pub fn update(
     };
     let groups = joined.groups_on(&cells)?;
     Ok((FeatureMap { info, positions_m: joined.positions_m, cells, groups, compass }, report))
+}
+
+/// Temperature and ratio of gaps of a map on which those frames of another drive showed the temperature `found`, in its own
+/// gaps: neither likelihoods nor sightings become sharper than the map had them.
+fn more_cautious(map: &MapInfo, found: f64) -> (f64, f64) {
+    let temperature = found.max(map.temperature);
+    let of_sightings = found.max(map.temperature / map.gap_ratio.powi(2));
+    (temperature, (temperature / of_sightings).sqrt())
 }
 
 /// The positions to learn from: as recorded, unless they are to be smoothed; refused where they err too much.
@@ -273,5 +284,20 @@ impl Joined {
         };
         let std_rad = joined.measured_std_rad();
         Some(Compass { std_rad, ..joined })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::map::tests::small_map;
+
+    #[test]
+    fn another_drive_makes_neither_likelihoods_nor_sightings_sharper() {
+        // Learned from frames held back: 16 in gaps twice as wide, so that sightings are as at 4.
+        let map = MapInfo { temperature: 16.0, gap_ratio: 2.0, ..small_map().info };
+        for (found, expected) in [(20.0, (20.0, 1.0)), (8.0, (16.0, 2.0_f64.sqrt())), (2.0, (16.0, 2.0))] {
+            assert_eq!(more_cautious(&map, found), expected, "{found}");
+        }
     }
 }

@@ -187,7 +187,8 @@ mod tests {
     #[test]
     fn an_impossible_map_is_refused() {
         type Spoil = fn(&mut FeatureMap);
-        let table: [(&str, Spoil); 11] = [
+        let table: [(&str, Spoil); 12] = [
+            ("no gaps", |map| map.info.gap_ratio = 0.0),
             ("no groups", |map| {
                 map.info.groups.clear();
                 map.groups.clear();
