@@ -52,12 +52,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(if works { DONE } else { FAILED }.into())
 }
 
-/// Only a localizing vehicle has a map.
+/// Only a localizing vehicle has these tables.
 fn load(args: &Args) -> Result<Purpose, BadArgument> {
     let is_for_localizing = std::fs::read_to_string(&args.config)
         .ok()
         .and_then(|text| text.parse::<toml::Table>().ok())
-        .is_some_and(|tables| tables.contains_key("map"));
+        .is_some_and(|tables| ["map", "motion", "outputs"].iter().any(|name| tables.contains_key(*name)));
     let purpose = match is_for_localizing {
         true => LocalizeConfig::load(&args.config).map(|config| Purpose::Localize(Box::new(config))),
         false => RecordConfig::load(&args.config).map(|config| Purpose::Record(Box::new(config))),

@@ -6,6 +6,7 @@ use super::{BadArgument, DATA_LOST, DONE, journal, options::check_input, print};
 use crate::{
     config::LocalizeConfig,
     localize::Stage,
+    outputs::OutputError,
     runtime::localize::{LocalizeReport, LocalizeStatus, live},
     types::PositionEstimate,
 };
@@ -42,7 +43,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     journal::start();
     let outcome = live::localize(&config, |status| journal::show_status(line(status)));
     journal::finish();
-    finish(&outcome?, args.timings)
+    match outcome {
+        Err(error) if matches!(error.downcast_ref(), Some(OutputError::NoOrigin)) => {
+            Err(wrong(error.to_string()).into())
+        }
+        outcome => finish(&outcome?, args.timings),
+    }
 }
 
 /// Says what became of the drive, on stderr: stdout may be full of estimates. [`DATA_LOST`] if no frame came.

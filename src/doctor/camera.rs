@@ -8,7 +8,11 @@ use crate::{
     config::Camera,
     devices::{CameraEvent, CameraFacts, DeviceError},
     jpeg::LumaDecoder,
-    runtime::live::DeviceRun,
+    map::MapInfo,
+    runtime::{
+        live::DeviceRun,
+        localize::lens_check::{LensCheck, LensVerdict},
+    },
     types::{Clock, DonutCalibration, NS_PER_S},
 };
 
@@ -26,6 +30,8 @@ const LEAST_RATE: f64 = 0.9;
 const MOST_DAMAGED: f64 = 0.02;
 /// A lens that is elsewhere by more has slipped \[px\].
 const SLIPPED_PX: f64 = 3.0;
+
+const MOUNT: &str = "is the lens on, in focus, and is there light? `omniloc calibrate` shows a picture of what it sees";
 
 /// What was seen of the camera.
 #[derive(Debug, Default)]
@@ -76,7 +82,15 @@ impl Look {
     }
 }
 
-pub fn findings(look: &Look, chosen: &Camera, calibration: Option<&DonutCalibration>) -> Vec<Finding> {
+/// What the camera is to look through.
+pub enum Expected {
+    /// The lens of this calibration, if there is one yet.
+    Calibration(Option<DonutCalibration>),
+    /// That of a map.
+    Map(Box<MapInfo>),
+}
+
+pub fn findings(look: &Look, chosen: &Camera, expected: &Expected) -> Vec<Finding> {
     let (asked_hz, device) = match chosen {
         Camera::V4l2(settings) => (Some(settings.frame_rate_hz), Some(settings.device.as_path())),
         _ => (look.facts.as_ref().map(|facts| facts.frame_rate_hz).filter(|rate_hz| *rate_hz > 0.0), None),
@@ -97,7 +111,10 @@ pub fn findings(look: &Look, chosen: &Camera, calibration: Option<&DonutCalibrat
     findings.push(Finding::ok("camera", format!("{name}{at}: {width_px} x {height_px} px, {pixel_format}")));
     findings.push(rate(look, asked_hz));
     findings.extend(quality(look));
-    findings.extend(lens(look, calibration));
+    findings.extend(match expected {
+        Expected::Calibration(known) => lens(look, known.as_ref()),
+        Expected::Map(info) => lens_of_map(look, info),
+    });
     findings
 }
 
@@ -111,7 +128,7 @@ fn rate(look: &Look, asked_hz: Option<f64>) -> Finding {
         Some(asked_hz) if rate_hz < LEAST_RATE * asked_hz => Finding::warning(
             "frame rate",
             found(asked_hz),
-            "more light, or exposure_auto_priority = false; a USB port of its own; another size or rate in [camera]",
+            "more light; a USB port of its own; another size or rate in [camera]",
         ),
         Some(asked_hz) => Finding::ok("frame rate", found(asked_hz)),
         None => Finding::ok("frame rate", format!("{rate_hz:.1} frames a second")),
@@ -140,16 +157,15 @@ fn lens(look: &Look, calibration: Option<&DonutCalibration>) -> Option<Finding> 
     if frames == 0 {
         return None;
     }
-    let mount = "is the lens on, in focus, and is there light? `omniloc calibrate` shows a picture of what it sees";
     let donut = match finder.finish() {
         Ok(donut) => donut,
-        Err(error) => return Some(Finding::warning("lens", error.to_string(), mount)),
+        Err(error) => return Some(Finding::warning("lens", error.to_string(), MOUNT)),
     };
     let (x_px, y_px) = (donut.center_x_px, donut.center_y_px);
     let (inner_px, outer_px) = (donut.inner_radius_px, donut.outer_radius_px);
     let found = format!("donut at ({x_px:.1}, {y_px:.1}), radii {inner_px:.1} .. {outer_px:.1} px");
     if let DonutVerdict::Doubtful(why) = &donut.verdict {
-        return Some(Finding::warning("lens", format!("{found}, doubtful: {}", why.join("; ")), mount));
+        return Some(Finding::warning("lens", format!("{found}, doubtful: {}", why.join("; ")), MOUNT));
     }
     let Some(known) = calibration else {
         let advice = "omniloc calibrate, and name its file in [vehicle] of the configuration";
@@ -162,6 +178,32 @@ fn lens(look: &Look, calibration: Option<&DonutCalibration>) -> Option<Finding> 
         return Some(Finding::warning("lens", found, "fasten the lens, then calibrate again: omniloc calibrate"));
     }
     Some(Finding::ok("lens", format!("{found}, as calibrated")))
+}
+
+/// Whether localizing will take this for the lens of the map, by the same look.
+fn lens_of_map(look: &Look, info: &MapInfo) -> Option<Finding> {
+    let facts = look.facts.as_ref()?;
+    let size_px = [facts.width_px as usize, facts.height_px as usize];
+    if size_px != info.image_size_px {
+        let ([width_px, height_px], [map_width_px, map_height_px]) = (size_px, info.image_size_px);
+        let found = format!("images of {width_px} x {height_px} px; the map's are {map_width_px} x {map_height_px} px");
+        let advice = "set width_px and height_px in [camera] to the map's, or train a map with this camera";
+        return Some(Finding::problem("lens", found, advice));
+    }
+    let mut check = LensCheck::new(&info.calibration);
+    let verdict = look.jpegs.iter().find_map(|jpeg| check.look(jpeg));
+    Some(match verdict {
+        Some(LensVerdict::Fits) => Finding::ok("lens", "that of the map, where the map has it"),
+        Some(LensVerdict::Slipped { by_px: [x_px, y_px], .. }) => {
+            let found = format!("that of the map, slipped by ({x_px:.1}, {y_px:.1}) px: the panorama follows it");
+            Finding::warning("lens", found, "fasten it")
+        }
+        Some(LensVerdict::Other(what)) => {
+            let advice = "mount the lens of the map, or train a map with this one";
+            Finding::problem("lens", format!("another than the map's: {what}"), advice)
+        }
+        Some(LensVerdict::Unclear(_)) | None => Finding::warning("lens", "it is not seen clearly", MOUNT),
+    })
 }
 
 #[cfg(test)]
@@ -188,7 +230,10 @@ mod tests {
     }
 
     fn verdicts(look: &Look) -> Vec<(&'static str, Verdict)> {
-        findings(look, &chosen(), None).iter().map(|finding| (finding.check, finding.verdict)).collect()
+        findings(look, &chosen(), &Expected::Calibration(None))
+            .iter()
+            .map(|finding| (finding.check, finding.verdict))
+            .collect()
     }
 
     #[test]
@@ -200,7 +245,7 @@ mod tests {
 
     #[test]
     fn what_is_wrong_is_found() {
-        let slow = findings(&look(15.0), &chosen(), None);
+        let slow = findings(&look(15.0), &chosen(), &Expected::Calibration(None));
         assert_eq!(slow[1].found, "15.0 frames a second, 30.0 asked for");
         assert_eq!(slow[1].verdict, Verdict::Warning);
         let damaged = Look { damaged: 9, ..look(30.0) };

@@ -8,12 +8,10 @@ use std::{
 use rustix::process::geteuid;
 
 use super::Finding;
-use crate::runtime::system::SystemMonitor;
+use crate::runtime::system::{SystemMonitor, knows_date};
 
 /// Boards slow down from 80 degrees on.
 const HOT_CELSIUS: f64 = 75.0;
-/// 2020: earlier is the date of a clock without a battery.
-const LEAST_REALTIME_S: u64 = 1_577_836_800;
 /// What a Raspberry Pi says of its power and warmth: now, and since it was switched on (16 bits higher).
 const THROTTLING: [(u32, &str, &str); 4] = [
     (0x1, "too little voltage", POWER),
@@ -26,12 +24,12 @@ const COOLING: &str = "a heat sink or a fan, and no sun on the case";
 
 pub fn examine() -> Vec<Finding> {
     let status = SystemMonitor::default().look(0);
-    let now_s = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
+    let now_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as i64);
     let process = fs::read_to_string("/proc/self/status").unwrap_or_default();
     vec![
         temperature(status.temperature_celsius),
         status.throttled.map_or_else(|| Finding::ok("power", "this computer does not say"), power),
-        date(now_s),
+        date(knows_date(now_ns)),
         sandbox(&process, geteuid().is_root()),
     ]
 }
@@ -63,14 +61,15 @@ fn power(bits: u32) -> Finding {
     }
 }
 
-fn date(now_s: u64) -> Finding {
-    match now_s < LEAST_REALTIME_S {
-        true => Finding::warning(
+fn date(is_known: bool) -> Finding {
+    match is_known {
+        false => Finding::warning(
             "clock",
-            "the computer does not know the date",
-            "nothing is lost: recordings keep the receiver's time; a clock with a battery or a network would set it",
+            "the computer does not know the date: it has no battery clock and has not heard the time from a network",
+            "recordings keep the receiver's time, so nothing is lost; localize says no time with its positions; a clock with a \
+             battery or a network would set it",
         ),
-        false => Finding::ok("clock", "the computer knows the date"),
+        true => Finding::ok("clock", "the computer knows the date"),
     }
 }
 
@@ -80,7 +79,7 @@ fn sandbox(status: &str, is_root: bool) -> Finding {
     let is_filtered = value("Seccomp:") == "2";
     let is_confined = value("NoNewPrivs:") == "1";
     if is_root {
-        let advice = "the services run as the user omniloc: sudo -u omniloc omniloc doctor sees what they see";
+        let advice = "the services run as the user omniloc: `sudo -u omniloc omniloc doctor` has their rights, but not their sandbox";
         return Finding::warning("sandbox", "this is root, who may do everything", advice);
     }
     match is_filtered && is_confined {
@@ -104,7 +103,7 @@ mod tests {
         let before = power(0x8_0000);
         assert_eq!(before.found, "since it was switched on: close to the temperature limit");
         assert_eq!(before.advice, COOLING);
-        assert_eq!((date(0).verdict, date(1_790_000_000).verdict), (Verdict::Warning, Verdict::Ok));
+        assert_eq!((date(false).verdict, date(true).verdict), (Verdict::Warning, Verdict::Ok));
     }
 
     #[test]

@@ -10,6 +10,7 @@ mod pins;
 mod receiver;
 
 use std::{
+    collections::BTreeMap,
     path::Path,
     sync::{Arc, mpsc},
     thread,
@@ -25,10 +26,11 @@ use crate::{
         DeviceError, Stop,
         gpio::{self, Led},
     },
-    map::OpenMap,
+    map::MapInfo,
     runtime::{
         drive::{self, SIMULATED_START},
         live::DeviceRun,
+        localize::live::open_map,
     },
     types::{Clock, ClockReading, DonutCalibration},
 };
@@ -43,6 +45,9 @@ pub struct Finding {
     /// What to do; empty where all is well.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub advice: String,
+    /// What was measured, for programs; names end with their units.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub figures: BTreeMap<&'static str, u64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -57,15 +62,15 @@ pub enum Verdict {
 
 impl Finding {
     fn ok(check: &'static str, found: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Ok, found: found.into(), advice: String::new() }
+        Self { check, verdict: Verdict::Ok, found: found.into(), advice: String::new(), figures: BTreeMap::new() }
     }
 
     fn warning(check: &'static str, found: impl Into<String>, advice: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Warning, found: found.into(), advice: advice.into() }
+        Self { verdict: Verdict::Warning, advice: advice.into(), ..Self::ok(check, found) }
     }
 
     fn problem(check: &'static str, found: impl Into<String>, advice: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Problem, found: found.into(), advice: advice.into() }
+        Self { verdict: Verdict::Problem, advice: advice.into(), ..Self::ok(check, found) }
     }
 }
 
@@ -95,15 +100,23 @@ pub fn examine(purpose: &Purpose, mut each: impl FnMut(Finding)) -> anyhow::Resu
     };
 
     let known = vehicle.calibration.as_deref().map(read_calibration).transpose();
-    let mut calibration = known.unwrap_or_else(|error| {
+    let mut expected = Expected::Calibration(known.unwrap_or_else(|error| {
         let advice = "`omniloc calibrate` makes one; without the key nothing is calibrated yet";
         tell(vec![Finding::problem("calibration", format!("{error:#}"), advice)]);
         None
-    });
+    }));
     if let Purpose::Localize(config) = purpose {
-        let (finding, of_map) = map(&config.map.file);
-        tell(vec![finding]);
-        calibration = of_map.or(calibration);
+        match open_map(&config.map.file) {
+            Ok(map) => {
+                let cells = map.cells.len();
+                tell(of_map(&config.map.file, cells, &map.info, config.outputs.has_nmea()));
+                expected = Expected::Map(Box::new(map.info));
+            }
+            Err(error) => {
+                let advice = "copy it there again, or train it: omniloc train REC --out AREA.map";
+                tell(vec![Finding::problem("map", format!("{error:#}"), advice)]);
+            }
+        }
     }
 
     let camera = drive::camera(chosen, simulation.as_ref())?;
@@ -115,7 +128,7 @@ pub fn examine(purpose: &Purpose, mut each: impl FnMut(Finding)) -> anyhow::Resu
         Some(camera) => {
             let look = camera::Look::at(camera, &clock);
             bytes_per_s = look.bytes_per_s();
-            tell(camera::findings(&look, chosen, calibration.as_ref()));
+            tell(camera::findings(&look, chosen, &expected));
         }
     }
     if let Purpose::Record(config) = purpose {
@@ -154,19 +167,17 @@ pub fn examine(purpose: &Purpose, mut each: impl FnMut(Finding)) -> anyhow::Resu
     Ok(())
 }
 
-/// The map, and the lens that it wants.
-fn map(path: &Path) -> (Finding, Option<DonutCalibration>) {
-    let open = || -> anyhow::Result<OpenMap> { Ok(OpenMap::open(Box::new(std::fs::File::open(path)?))?) };
-    match open() {
-        Ok(map) => {
-            let found = format!("{}: {} cells, {} groups", path.display(), map.cells.len(), map.info.groups.len());
-            (Finding::ok("map", found), Some(map.info.calibration))
-        }
-        Err(error) => {
-            let advice = "copy it there again, or train it: omniloc train REC --out AREA.map";
-            (Finding::problem("map", format!("{}: {error:#}", path.display()), advice), None)
-        }
+/// What the map is, and whether it is enough for what is to be said.
+fn of_map(path: &Path, cells: usize, info: &MapInfo, says_nmea: bool) -> Vec<Finding> {
+    let found = format!("{}: {cells} cells, {} groups", path.display(), info.groups.len());
+    let mut findings = vec![Finding::ok("map", found)];
+    if says_nmea && info.origin.is_none() {
+        let advice =
+            "survey with a receiver, or `omniloc import --origin`, and train again; or take outputs.nmea_* out";
+        let found = "NMEA is to be sent, but the map does not know where on Earth it lies";
+        findings.push(Finding::problem("outputs", found, advice));
     }
+    findings
 }
 
 fn read_calibration(path: &Path) -> anyhow::Result<DonutCalibration> {

@@ -112,6 +112,13 @@ pub fn findings(look: &Look, port: Option<&Path>) -> Vec<Finding> {
         findings.push(Finding::problem("receiver", line, what));
         return findings;
     }
+    if understood == counters.ignored {
+        let what = "the Arduino is well and its sensor says nothing: the MTi's power, its wires to pins 19 and 18, the level \
+                    shifter; or the receiver is not set to send GGA and HDT, MTData2 and the like";
+        let found = format!("{line}, of which none says a position, a yaw or a time");
+        findings.push(Finding::warning("receiver", found, what));
+        return findings;
+    }
     findings.push(match damaged * 20 > understood {
         true => Finding::warning("receiver", line, "shorter or better wires, a common ground, the right level shifter"),
         false => Finding::ok("receiver", line),
@@ -242,9 +249,14 @@ mod tests {
 
     #[test]
     fn what_is_wrong_is_found() {
-        let cases: [(Look, &str, Verdict); 7] = [
+        let cases: [(Look, &str, Verdict); 8] = [
             (Look { opened: None, ..look() }, "receiver", Verdict::Problem),
             (Look { counters: DecoderCounters::default(), ..look() }, "receiver", Verdict::Problem),
+            (
+                Look { counters: DecoderCounters { ignored: 30, ..DecoderCounters::default() }, ..look() },
+                "receiver",
+                Verdict::Warning,
+            ),
             (Look { fix: None, ..look() }, "position", Verdict::Warning),
             (Look { fixes_ns: Some([0, 13 * NS_PER_S]), ..look() }, "position", Verdict::Warning),
             (Look { heading: None, ..look() }, "yaw", Verdict::Warning),

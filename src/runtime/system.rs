@@ -48,6 +48,21 @@ impl SystemMonitor {
     }
 }
 
+/// Realtime before this, 2020, is that of a computer that was never told the date.
+const LEAST_REALTIME_NS: i64 = 1_577_836_800_000_000_000;
+
+/// Whether realtime may be taken for UTC. Without a battery clock a computer starts with the date at which it was switched
+/// off, until systemd-timesyncd, where that keeps the time, has heard a better one.
+pub fn knows_date(realtime_ns: i64) -> bool {
+    realtime_ns >= LEAST_REALTIME_NS && is_kept(Path::new("/"))
+}
+
+fn is_kept(root: &Path) -> bool {
+    let has_battery = fs::read_to_string(root.join("sys/class/rtc/rtc0/hctosys")).is_ok_and(|text| text.trim() == "1");
+    let timesync = root.join("run/systemd/timesync");
+    has_battery || !timesync.exists() || timesync.join("synchronized").exists()
+}
+
 static THROTTLED: LazyLock<Option<PathBuf>> = LazyLock::new(|| find_throttled(Path::new("/sys/devices/platform")));
 
 /// What a Raspberry Pi says of its voltage: `soc/soc:firmware/get_throttled`, on a Pi 5 below `soc@107c000000:firmware`.
@@ -102,6 +117,27 @@ mod tests {
             let expected = (!firmware.starts_with("axi")).then_some(file);
             assert_eq!(find_throttled(platform.path()), expected);
         }
+    }
+
+    #[test]
+    fn the_date_of_the_last_switching_off_is_no_date() {
+        let root = tempfile::tempdir().expect("a folder");
+        let write = |path: &str, text: &str| {
+            let path = root.path().join(path);
+            fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+            fs::write(path, text).expect("writes");
+        };
+        assert!(is_kept(root.path()), "by something else than systemd-timesyncd");
+        fs::create_dir_all(root.path().join("run/systemd/timesync")).expect("a folder");
+        assert!(!is_kept(root.path()), "it has heard of none yet");
+        write("sys/class/rtc/rtc0/hctosys", "0\n");
+        assert!(!is_kept(root.path()), "a clock that the kernel did not take the time of");
+        write("run/systemd/timesync/synchronized", "");
+        assert!(is_kept(root.path()));
+        fs::remove_file(root.path().join("run/systemd/timesync/synchronized")).expect("removes");
+        write("sys/class/rtc/rtc0/hctosys", "1\n");
+        assert!(is_kept(root.path()), "a clock with a battery");
+        assert!(!knows_date(LEAST_REALTIME_NS - 1));
     }
 
     #[test]

@@ -4,7 +4,10 @@ use std::{
     fs, io,
     os::unix::fs::MetadataExt,
     path::{Path, PathBuf},
-    sync::{Arc, Mutex, PoisonError},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
     thread::JoinHandle,
     time::Duration,
 };
@@ -30,7 +33,7 @@ use crate::{
         service::Service,
         signals::StopSignals,
         supervisor::{self, join_within, supervise},
-        system::{SystemMonitor, SystemStatus},
+        system::{SystemMonitor, SystemStatus, knows_date},
     },
     types::{Clock, PositionEstimate},
 };
@@ -38,8 +41,6 @@ use crate::{
 /// Part of the time to stop that the camera and the localizer have.
 const STOP_LIMIT: Duration = Duration::from_secs(3);
 const RECORDER_STOP_LIMIT: Duration = Duration::from_secs(12);
-/// Realtime before this, 2020, is that of a computer without a battery clock that has not been told the date.
-const LEAST_REALTIME_NS: i64 = 1_577_836_800_000_000_000;
 
 /// How it goes, once a second.
 #[derive(Debug, Clone, Default)]
@@ -96,6 +97,7 @@ pub fn localize(
     let speed = config.simulation.as_ref().map_or(1.0, |simulation| simulation.speed) * config.replay_speed;
     let clock = drive::clock(start, speed, simulation.as_ref().map(|(simulation, _)| simulation));
 
+    let date = DateWatch::new(&clock, start.is_none());
     let recorder = start_recorder(config, calibration, &clock)?;
 
     let frames = Arc::new(Newest::default());
@@ -105,11 +107,11 @@ pub fn localize(
     let camera = start_camera(camera, &frames, &health, &clock, &stop)?;
     let outputs = Arc::new(outputs);
     let sinks = Sinks { outputs: outputs.clone(), recorder: recorder.as_ref().map(Recorder::handle) };
-    let localizer = start_localizer(session, &frames, &shared, sinks, &clock)?;
+    let localizer = start_localizer(session, &frames, &shared, sinks, &date)?;
 
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("starting the runtime")?;
     let second = Duration::from_secs_f64(1.0 / speed);
-    let mut watch = Watch { frames, shared, health, map: watched, system: SystemMonitor::default(), clock };
+    let mut watch = Watch { frames, shared, health, map: watched, system: SystemMonitor::default(), date, clock };
     let outcome = runtime.block_on(until_stopped(&mut watch, second, &localizer, each_second));
 
     stop.stop();
@@ -199,13 +201,13 @@ fn start_localizer(
     frames: &Arc<Newest>,
     shared: &Arc<Mutex<Shared>>,
     sinks: Sinks,
-    clock: &Arc<dyn Clock>,
+    date: &DateWatch,
 ) -> anyhow::Result<JoinHandle<()>> {
-    let (frames, shared, clock) = (frames.clone(), shared.clone(), clock.clone());
+    let (frames, shared, date) = (frames.clone(), shared.clone(), date.clone());
     let run = move || {
         while let Some(event) = frames.next() {
             match session.take(&event) {
-                Ok(Some(estimate)) => sinks.send(&estimate, utc_ns(&*clock, estimate.stamp_ns)),
+                Ok(Some(estimate)) => sinks.send(&estimate, date.utc_ns(estimate.stamp_ns)),
                 Ok(None) => {}
                 Err(error) => {
                     lock(&shared).error = Some(error);
@@ -220,11 +222,36 @@ fn start_localizer(
     std::thread::Builder::new().name("localizer".into()).spawn(run).context("starting the thread localizer")
 }
 
-/// UTC of a stamp by the computer's clock, if it has been told the date.
-fn utc_ns(clock: &dyn Clock, stamp_ns: u64) -> Option<i64> {
+/// UTC of a stamp by the computer's clock.
+fn utc_ns(clock: &dyn Clock, stamp_ns: u64) -> i64 {
     let now = clock.read();
-    let utc_ns = now.realtime_ns - (now.monotonic_ns as i64 - stamp_ns as i64);
-    (utc_ns >= LEAST_REALTIME_NS).then_some(utc_ns)
+    now.realtime_ns - (now.monotonic_ns as i64 - stamp_ns as i64)
+}
+
+/// Whether the clock is right, looked at once a second.
+#[derive(Clone)]
+struct DateWatch {
+    clock: Arc<dyn Clock>,
+    /// A simulated or replayed clock is.
+    is_of_computer: bool,
+    is_known: Arc<AtomicBool>,
+}
+
+impl DateWatch {
+    fn new(clock: &Arc<dyn Clock>, is_of_computer: bool) -> Self {
+        let watch = Self { clock: clock.clone(), is_of_computer, is_known: Arc::default() };
+        watch.look();
+        watch
+    }
+
+    fn look(&self) {
+        let is_known = !self.is_of_computer || knows_date(self.clock.read().realtime_ns);
+        self.is_known.store(is_known, Ordering::Relaxed);
+    }
+
+    fn utc_ns(&self, stamp_ns: u64) -> Option<i64> {
+        self.is_known.load(Ordering::Relaxed).then(|| utc_ns(&*self.clock, stamp_ns))
+    }
 }
 
 /// What is looked at once a second.
@@ -234,6 +261,7 @@ struct Watch {
     health: Arc<Mutex<&'static str>>,
     map: MapWatch,
     system: SystemMonitor,
+    date: DateWatch,
     clock: Arc<dyn Clock>,
 }
 
@@ -272,6 +300,7 @@ async fn until_stopped(
         select! {
             _ = seconds.tick() => {
                 watch.map.look();
+                watch.date.look();
                 let frames = watch.shared().counts.frames;
                 let status = watch.status((frames - frames_before) as f64);
                 // Frames that come and are not looked at.

@@ -8,7 +8,7 @@
 //! [`playback`] takes a recorded drive the same way without a clock. A frame that comes while older ones wait takes the place of the oldest: an estimate is of now. `session` is what a live
 //! and a replayed drive have in common.
 
-mod lens_check;
+pub mod lens_check;
 pub mod live;
 mod newest;
 pub mod playback;
