@@ -6,7 +6,7 @@ use faer::Mat;
 
 use super::panoramas::describe_panoramas;
 use super::perturbation::perturbed;
-use super::track::{PointFollower, PointTrack, Sighting};
+use super::track::{KeptImage, PointFollower, PointTrack, Sighting};
 use crate::features::{COMPASS_BYTES, Describer, Descriptor};
 use crate::panorama::Panorama;
 use crate::recording::{Recording, RecordingError, SurveyFrame};
@@ -23,6 +23,8 @@ pub struct Survey {
     /// Frame × [`COMPASS_BYTES`]; empty if not asked for.
     compass: Vec<i8>,
     points: Vec<PointTrack>,
+    /// Of each frame, if points were followed through it.
+    images: Vec<Option<KeptImage>>,
     properties: BTreeMap<Descriptor, Properties>,
 }
 
@@ -106,6 +108,7 @@ impl Survey {
             frames: Vec::new(),
             compass: Vec::new(),
             points: Vec::new(),
+            images: Vec::new(),
             properties: options.descriptors.iter().map(|&descriptor| (descriptor, Properties::default())).collect(),
         };
         for (number, recording) in recordings.iter().enumerate() {
@@ -151,6 +154,7 @@ impl Survey {
             .then(|| PointFollower::new(self.calibration.azimuth));
         let mut sightings: Vec<Vec<Sighting>> = Vec::new();
         let take = |frame: SurveyFrame, DescribedFrame { properties, compass, wide }| {
+            self.images.push(follower.is_some().then(|| KeptImage::new(&wide, self.calibration.azimuth)));
             if let (Some(follower), Some(yaw_rad)) = (&mut follower, frame.yaw_rad) {
                 sightings.push(follower.take(&wide, yaw_rad));
             }
@@ -201,6 +205,11 @@ impl Survey {
     /// Points of the scene that were followed.
     pub fn points(&self) -> &[PointTrack] {
         &self.points
+    }
+
+    /// Of every frame, where points were followed.
+    pub fn images(&self) -> &[Option<KeptImage>] {
+        &self.images
     }
 
     /// What the frames are described by.

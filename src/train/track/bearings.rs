@@ -25,11 +25,13 @@ const DISTANCES_M: std::ops::Range<f64> = 0.3..100.0;
 const MOST_MISS_STDS: f64 = 2.0;
 const STEPS: usize = 5;
 
-/// A point as some frames of a recording saw it.
-#[derive(Debug, Clone, PartialEq)]
+/// A point as some frames saw it.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointTrack {
     /// Row of the survey, azimuth \[rad\].
     bearings: Vec<(usize, f64)>,
+    /// In which row of the panorama each saw it \[px\]; empty where it is joined of several passes.
+    heights_px: Vec<f32>,
 }
 
 /// Where the unknowns of a recording's frames are, and what is known of their directions.
@@ -51,14 +53,35 @@ pub struct Frames<'a> {
 impl PointTrack {
     /// Of the sightings of rows `first`, `first` + 1, …
     pub fn gather(first: usize, sightings: &[Vec<Sighting>]) -> Vec<Self> {
-        let mut of_point: BTreeMap<usize, Vec<(usize, f64)>> = BTreeMap::new();
+        let mut of_point: BTreeMap<usize, Self> = BTreeMap::new();
         for (i, sightings) in sightings.iter().enumerate() {
             for sighting in sightings {
-                of_point.entry(sighting.point).or_default().push((first + i, sighting.azimuth_rad));
+                let track = of_point.entry(sighting.point).or_default();
+                track.bearings.push((first + i, sighting.azimuth_rad));
+                track.heights_px.push(sighting.height_px);
             }
         }
-        let often = of_point.into_values().filter(|bearings| bearings.len() >= FEWEST_SIGHTINGS);
-        often.map(|bearings| Self { bearings }).collect()
+        of_point.into_values().filter(|track| track.bearings.len() >= FEWEST_SIGHTINGS).collect()
+    }
+
+    /// Sightings of it, so many at most, that lie nearest to `row` in its order, of those that `is_used`.
+    pub fn around(&self, row: usize, most: usize, is_used: impl Fn(usize) -> bool) -> Vec<(usize, f64)> {
+        let mut used: Vec<(usize, f64)> = self.bearings.iter().copied().filter(|&(row, _)| is_used(row)).collect();
+        used.sort_by_key(|&(other, _)| (other.abs_diff(row), other));
+        used.truncate(most);
+        used.sort_by_key(|&(row, _)| row);
+        used
+    }
+
+    /// Every row that it was seen from, the azimuth and the row of the panorama.
+    pub fn sightings(&self) -> impl Iterator<Item = (usize, f64, f32)> + '_ {
+        let sightings = self.bearings.iter().zip(&self.heights_px);
+        sightings.map(|(&(row, azimuth_rad), &height_px)| (row, azimuth_rad, height_px))
+    }
+
+    /// Of what several passes saw.
+    pub fn joined(bearings: Vec<(usize, f64)>) -> Self {
+        Self { bearings, heights_px: Vec::new() }
     }
 
     /// The parts of it that `is_used` leaves.
@@ -113,24 +136,29 @@ impl Frames<'_> {
     /// n_i·(δL + b_i − b_i°) / d_i + ε_i + κ = β_i − atan2(L − p_i)
     /// ```
     ///
-    /// with the errors b of the positions, ε of the yaw, κ of the camera. Multiplied by an orthogonal matrix that makes
+    /// with the errors b of the positions, ε of the yaw, κ of the recording's camera. Multiplied by an orthogonal matrix that makes
     /// the first two of them the only ones with the point's own δL, which are left out (Mourikis & Roumeliotis 2007,
     /// section III-D).
     fn equations_of(&self, bearings: &[(usize, f64)]) -> Option<Vec<Equation>> {
         let Triangulated { point_m, misses, weights } = self.triangulated(bearings)?;
         let m = bearings.len();
+        // One a recording.
+        let mut cameras: Vec<usize> = bearings.iter().map(|&(row, _)| self.camera[row]).collect();
+        cameras.sort_unstable();
+        cameras.dedup();
+        let right = 3 * m + cameras.len();
         // Columns of δL, and of everything else: a row an equation.
         let mut of_point = vec![[0.0; 2]; m];
-        let mut terms: Vec<Vec<f64>> = vec![vec![0.0; 3 * m + 2]; m];
+        let mut terms: Vec<Vec<f64>> = vec![vec![0.0; right + 1]; m];
         for (i, &(row, _)) in bearings.iter().enumerate() {
             let p = self.positions_m[row];
             let d = distance_m(p, point_m);
             let n = [-(point_m[1] - p[1]) / (d * d), (point_m[0] - p[0]) / (d * d)];
             of_point[i] = n;
             terms[i][3 * i..3 * i + 3].copy_from_slice(&[n[0], n[1], 1.0]);
-            terms[i][3 * m] = 1.0;
+            terms[i][3 * m + cameras.partition_point(|&camera| camera < self.camera[row])] = 1.0;
             let error = [0, 1].map(|axis| self.received_m[row][axis] - p[axis]);
-            terms[i][3 * m + 1] = misses[i] + self.yaw_error_rad[row] + n[0] * error[0] + n[1] * error[1];
+            terms[i][right] = misses[i] + self.yaw_error_rad[row] + n[0] * error[0] + n[1] * error[1];
             let weight = weights[i].sqrt();
             of_point[i].iter_mut().chain(&mut terms[i]).for_each(|value| *value *= weight);
         }
@@ -138,16 +166,26 @@ impl Frames<'_> {
             reflect(&mut of_point, &mut terms, axis);
         }
         let first: Vec<usize> = bearings.iter().filter_map(|&(row, _)| self.first_unknown[row]).collect();
-        let camera = self.camera[bearings[0].0];
-        let unknown = |k: usize| if k == 3 * m { camera } else { first[k / 3] + k % 3 };
+        let unknown = |k: usize| if k >= 3 * m { cameras[k - 3 * m] } else { first[k / 3] + k % 3 };
         let equation = |row: &Vec<f64>| Equation {
-            terms: row[..=3 * m].iter().enumerate().map(|(k, &value)| (unknown(k), value)).collect(),
-            right: row[3 * m + 1],
+            terms: row[..right].iter().enumerate().map(|(k, &value)| (unknown(k), value)).collect(),
+            right: row[right],
             variance: (self.loosening * BEARING_STD_RAD).powi(2),
             has_outliers: false,
             length: None,
         };
         Some(terms[2..].iter().map(equation).collect())
+    }
+
+    /// Where the `bearings` meet.
+    pub fn place_m(&self, bearings: &[(usize, f64)]) -> Option<PositionM> {
+        (bearings.len() >= FEWEST_SIGHTINGS).then(|| self.triangulated(bearings)).flatten().map(|found| found.point_m)
+    }
+
+    /// The azimuth that `row` sees a point at.
+    pub fn azimuth_rad(&self, row: usize, point_m: PositionM) -> f64 {
+        let p = self.positions_m[row];
+        (point_m[1] - p[1]).atan2(point_m[0] - p[0]) - self.yaw_rad[row] + self.yaw_error_rad[row]
     }
 
     /// From east, counter-clockwise.
@@ -259,7 +297,8 @@ mod tests {
     }
 
     impl Street {
-        /// The camera is turned by `camera_rad`, and the yaw of every other frame off by as much.
+        /// The camera is turned by `camera_rad`, from the fifteenth frame on by as much the other way, and the yaw of every
+        /// other frame off by as much.
         fn new(error_m: f64, camera_rad: f64) -> Self {
             let mut random = ChaCha8Rng::seed_from_u64(4);
             let mut normal = || f64::from(standard_normal(&mut random));
@@ -273,7 +312,8 @@ mod tests {
             received_m[29] = truth_m[29];
             let error_rad = |i: usize| if i.is_multiple_of(2) { camera_rad } else { 0.0 };
             let yaw_rad: Vec<f64> = (0..30).map(|i| 0.05 * i as f64 + error_rad(i)).collect();
-            let yaw_error_rad: Vec<f64> = (0..30).map(|i| error_rad(i) + camera_rad).collect();
+            let yaw_error_rad: Vec<f64> =
+                (0..30).map(|i| error_rad(i) + if i < 15 { camera_rad } else { -camera_rad }).collect();
             let tracks = (0..60)
                 .map(|k| {
                     let first = (7 * k) % 25;
@@ -282,7 +322,7 @@ mod tests {
                         let to = [point[0] - truth_m[row][0], point[1] - truth_m[row][1]];
                         (row, to[1].atan2(to[0]) - yaw_rad[row] + yaw_error_rad[row])
                     };
-                    PointTrack { bearings: (first..first + 6).map(bearing).collect() }
+                    PointTrack::joined((first..first + 6).map(bearing).collect())
                 })
                 .collect();
             Self { truth_m, received_m, yaw_rad, yaw_error_rad, tracks }
@@ -300,11 +340,22 @@ mod tests {
                 yaw_rad: &self.yaw_rad,
                 yaw_error_rad: &self.yaw_error_rad,
                 first_unknown,
-                camera: &[90; 30],
+                camera: &CAMERAS,
                 loosening,
             }
         }
     }
+
+    /// After the unknowns of the frames.
+    const CAMERAS: [usize; 30] = {
+        let mut cameras = [90; 30];
+        let mut row = 15;
+        while row < 30 {
+            cameras[row] = 91;
+            row += 1;
+        }
+        cameras
+    };
 
     fn first_unknown() -> Vec<Option<usize>> {
         (0..30).map(|row| Some(3 * row)).collect()
@@ -315,11 +366,16 @@ mod tests {
         let (street, first_unknown) = (Street::new(0.3, 0.02), first_unknown());
         let equations = street.frames(&street.truth_m, &first_unknown, 1.0).equations(&street.tracks, |_| true);
         assert!(equations.len() > 100, "{}", equations.len());
-        const CAMERA: usize = 30;
         let error = |at: usize| match (at / 3, at % 3) {
-            (CAMERA, _) => 0.02,
+            (30, camera) => [0.02, -0.02][camera],
             (row, axis @ 0..2) => street.received_m[row][axis] - street.truth_m[row][axis],
-            (row, _) => street.yaw_error_rad[row] - 0.02,
+            (row, _) => {
+                if row % 2 == 0 {
+                    0.02
+                } else {
+                    0.0
+                }
+            }
         };
         for equation in &equations {
             let left: f64 = equation.terms.iter().map(|&(at, value)| value * error(at)).sum();
@@ -334,13 +390,13 @@ mod tests {
         for loosening in [8.0, 4.0, 2.0, 1.0, 1.0, 1.0] {
             let frames = street.frames(&positions_m, &first_unknown, loosening);
             let mut equations: Vec<Equation> = (0..30).map(|row| yaw_prior(3 * row + 2, 0.0)).collect();
-            equations.push(camera_prior(90));
+            equations.extend([90, 91].map(camera_prior));
             equations.extend((0..30).flat_map(|row| {
                 let std_m = if row == 0 || row == 29 { 0.001 } else { 100.0 };
                 [0, 1].map(|axis| prior(3 * row + axis, std_m))
             }));
             equations.extend(frames.equations(&street.tracks, |_| true));
-            let solution = solve(91, &equations).expect("determined");
+            let solution = solve(92, &equations).expect("determined");
             let error = |row: usize, axis: usize| solution.unknowns[3 * row + axis];
             positions_m =
                 (0..30).map(|row| [0, 1].map(|axis| street.received_m[row][axis] - error(row, axis))).collect();

@@ -1,6 +1,7 @@
 //! Points of the scene, followed from frame to frame through the panoramas of a recording.
 
 use std::f64::consts::TAU;
+use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -34,6 +35,11 @@ const SURE_CORRELATION: f32 = 0.95;
 /// Where a point is looked for, from where its last step would take it: a step moves far ones little, and near ones further
 /// than [`step_by_step`] gets by itself.
 const GUESSES_PX: [f32; 7] = [0.0, -6.0, 6.0, -12.0, 12.0, -20.0, 20.0];
+/// The same in another pass, from where bearings say it is: that is off by a share of the error across the street.
+const GUESSES_ACROSS_PX: [f32; 3] = [0.0, -5.0, 5.0];
+/// What is nearer or further away in another pass is larger or smaller there, which is allowed for so far: pixels of the one
+/// frame to a pixel of the other.
+const SPACINGS_PX: std::ops::RangeInclusive<f64> = 0.5..=2.0;
 
 /// A point of the scene as a frame saw it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,6 +48,8 @@ pub struct Sighting {
     pub point: usize,
     /// From ahead, counter-clockwise, but for an angle that is the same for all of a camera.
     pub azimuth_rad: f64,
+    /// Row of the panorama \[px\].
+    pub height_px: f32,
 }
 
 /// Follows points (Lucas & Kanade 1981, over an image pyramid, Bouguet 2000) whose two gradients are strong (Shi & Tomasi
@@ -78,11 +86,7 @@ impl PointFollower {
         let mut points = Vec::with_capacity(POINTS);
         if let Some(before) = &self.before {
             // What a turn of the vehicle alone does to the columns.
-            let turned = (before.yaw_rad - yaw_rad) / TAU * WIDE_COLUMNS as f64;
-            let turned = match self.azimuth {
-                AzimuthSense::Ccw => turned,
-                AzimuthSense::Cw => -turned,
-            } as f32;
+            let turned = columns_px(before.yaw_rad - yaw_rad, self.azimuth);
             let followed: Vec<Option<Point>> =
                 before.points.par_iter().map(|point| point.followed(&before.pyramid, &pyramid, turned)).collect();
             for point in followed.into_iter().flatten() {
@@ -93,15 +97,12 @@ impl PointFollower {
             }
         }
         self.add_new(&pyramid[0], &mut points);
-        let sightings = points.iter().map(|point| {
-            let angle_rad = f64::from(point.at[0]) / WIDE_COLUMNS as f64 * TAU;
-            let azimuth_rad = match self.azimuth {
-                AzimuthSense::Ccw => angle_rad,
-                AzimuthSense::Cw => -angle_rad,
-            };
-            Sighting { point: point.number, azimuth_rad }
-        });
-        let sightings = sightings.collect();
+        let sighting = |point: &Point| Sighting {
+            point: point.number,
+            azimuth_rad: azimuth_rad(point.at[0], self.azimuth),
+            height_px: point.at[1],
+        };
+        let sightings = points.iter().map(sighting).collect();
         self.before = Some(Seen { pyramid, yaw_rad, points });
         sightings
     }
@@ -129,25 +130,89 @@ impl Point {
     /// In the next frame, where a turn alone would have moved it by so many columns. Of what is found from several guesses,
     /// what looks most like it.
     fn followed(&self, before: &[Plane], now: &[Plane], turned_px: f32) -> Option<Self> {
-        let mut best: Option<(f32, Self)> = None;
-        for further_px in GUESSES_PX {
-            let guess = [turned_px + self.shift_px + further_px, 0.0];
-            let Some(at) = follow(before, now, self.at, guess) else { continue };
-            let back = follow(now, before, at, guess.map(|px| -px));
-            if back.is_none_or(|back| apart_px(back, self.at) > MOST_MISS_PX) {
-                continue;
-            }
-            let likeness = correlation(&before[0], self.at, &now[0], at);
-            if likeness > best.map_or(LEAST_CORRELATION, |(best, _)| best) {
-                let shift_px = shorter_way_px(at[0] - self.at[0] - turned_px);
-                best = Some((likeness, Self { at, shift_px, ..*self }));
-            }
-            if likeness > SURE_CORRELATION {
-                break;
-            }
-        }
-        best.map(|(_, point)| point)
+        let guesses_px = GUESSES_PX.map(|further_px| turned_px + self.shift_px + further_px);
+        let at = found(before, now, self.at, &guesses_px, 1.0)?;
+        Some(Self { at, shift_px: shorter_way_px(at[0] - self.at[0] - turned_px), ..*self })
     }
+}
+
+/// A frame's wide panorama, kept so that points of other frames can be looked for in it.
+#[derive(Debug, Clone)]
+pub struct KeptImage {
+    /// Whole gray values, which take a quarter of the memory.
+    wide: Arc<[u8]>,
+    azimuth: AzimuthSense,
+}
+
+/// A point that one frame sees and that is looked for in another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wanted {
+    /// Where the one sees it.
+    pub azimuth_rad: f64,
+    pub height_px: f32,
+    /// Where the other is thought to, and how many times as far away it is from there.
+    pub thought_rad: f64,
+    pub farther: f64,
+}
+
+impl KeptImage {
+    pub fn new(wide: &[f32], azimuth: AzimuthSense) -> Self {
+        Self { wide: wide.iter().map(|value| value.round() as u8).collect(), azimuth }
+    }
+
+    /// The azimuths at which this frame sees the points `wanted` of `other`; `None` for those that it does not show.
+    pub fn find(&self, other: &Self, wanted: &[Wanted]) -> Vec<Option<f64>> {
+        let (before, now) = (other.levels(), self.levels());
+        let find = |wanted: &Wanted| {
+            let here = [columns_px(wanted.azimuth_rad, other.azimuth), wanted.height_px];
+            let thought_px = shorter_way_px(columns_px(wanted.thought_rad, self.azimuth) - here[0]);
+            let guesses_px = GUESSES_ACROSS_PX.map(|further_px| thought_px + further_px);
+            let spacing_px = wanted.farther.clamp(*SPACINGS_PX.start(), *SPACINGS_PX.end()) as f32;
+            found(&before, &now, here, &guesses_px, spacing_px).map(|at| azimuth_rad(at[0], self.azimuth))
+        };
+        wanted.iter().map(find).collect()
+    }
+
+    fn levels(&self) -> Vec<Plane> {
+        pyramid(&self.wide.iter().map(|&value| f32::from(value)).collect::<Vec<f32>>())
+    }
+}
+
+fn azimuth_rad(columns_px: f32, azimuth: AzimuthSense) -> f64 {
+    let angle_rad = f64::from(columns_px) / WIDE_COLUMNS as f64 * TAU;
+    match azimuth {
+        AzimuthSense::Ccw => angle_rad,
+        AzimuthSense::Cw => -angle_rad,
+    }
+}
+
+fn columns_px(azimuth_rad: f64, azimuth: AzimuthSense) -> f32 {
+    let columns_px = azimuth_rad / TAU * WIDE_COLUMNS as f64;
+    match azimuth {
+        AzimuthSense::Ccw => columns_px as f32,
+        AzimuthSense::Cw => -columns_px as f32,
+    }
+}
+
+/// Where in `now` is what is at `here` in `before`, looked for so many columns further on. Of what is found there and back
+/// again, what looks most like it. A pixel of `now` is `spacing_px` of `before`.
+fn found(before: &[Plane], now: &[Plane], here: [f32; 2], guesses_px: &[f32], spacing_px: f32) -> Option<[f32; 2]> {
+    let mut best: Option<(f32, [f32; 2])> = None;
+    for &guess_px in guesses_px {
+        let Some(at) = follow(before, now, here, [guess_px, 0.0], spacing_px) else { continue };
+        let back = follow(now, before, at, [-guess_px, 0.0], 1.0 / spacing_px);
+        if back.is_none_or(|back| apart_px(back, here) > MOST_MISS_PX) {
+            continue;
+        }
+        let likeness = correlation(&before[0].square(here, spacing_px), &now[0].square(at, 1.0));
+        if likeness > best.map_or(LEAST_CORRELATION, |(best, _)| best) {
+            best = Some((likeness, at));
+        }
+        if likeness > SURE_CORRELATION {
+            break;
+        }
+    }
+    best.map(|(_, at)| at)
 }
 
 /// One level of a pyramid. Columns wrap round, rows end.
@@ -192,10 +257,10 @@ impl Plane {
         upper + dy * (row(below) - upper)
     }
 
-    /// The square of pixels around a place.
-    fn square(&self, [x, y]: [f32; 2]) -> [f32; SIDE_PX * SIDE_PX] {
+    /// The square of pixels around a place, `spacing_px` from each to the next.
+    fn square(&self, [x, y]: [f32; 2], spacing_px: f32) -> [f32; SIDE_PX * SIDE_PX] {
         std::array::from_fn(|i| {
-            let [dx, dy] = [i % SIDE_PX, i / SIDE_PX].map(|d| d as f32 - HALF_PX as f32);
+            let [dx, dy] = [i % SIDE_PX, i / SIDE_PX].map(|d| spacing_px * (d as f32 - HALF_PX as f32));
             self.at([x + dx, y + dy])
         })
     }
@@ -243,15 +308,16 @@ impl Plane {
     }
 }
 
-/// Where the square of `from` around `at` is in `to`, `guess` further on to begin with; `None` where it is not found.
-fn follow(from: &[Plane], to: &[Plane], at: [f32; 2], guess: [f32; 2]) -> Option<[f32; 2]> {
+/// Where the square of `from` around `at`, `spacing_px` of whose pixels are one of `to`, is there, `guess` further on to
+/// begin with; `None` where it is not found.
+fn follow(from: &[Plane], to: &[Plane], at: [f32; 2], guess: [f32; 2], spacing_px: f32) -> Option<[f32; 2]> {
     let scale = |level: usize| 0.5_f32.powi(level as i32);
     let mut shift = guess;
     for level in (0..LEVELS).rev() {
         // The centre of pixel 0 lies between those of the two it was made of.
         let here = at.map(|at| (at + 0.5) * scale(level) - 0.5);
-        shift =
-            step_by_step(&from[level], &to[level], here, shift.map(|s| s * scale(level)))?.map(|s| s / scale(level));
+        let guess = shift.map(|s| s * scale(level));
+        shift = step_by_step(&from[level], &to[level], here, guess, spacing_px)?.map(|s| s / scale(level));
     }
     let there = [(at[0] + shift[0]).rem_euclid(WIDE_COLUMNS as f32), at[1] + shift[1]];
     (ROWS.start as f32..ROWS.end as f32).contains(&there[1]).then_some(there)
@@ -259,12 +325,13 @@ fn follow(from: &[Plane], to: &[Plane], at: [f32; 2], guess: [f32; 2]) -> Option
 
 /// Gauss-Newton on Σ (to(x + s)/g − from(x))² over the square, both less their means, with the gradient of `from` (Baker &
 /// Matthews 2004) and the gain g that fits best: brightness may have changed.
-fn step_by_step(from: &Plane, to: &Plane, at: [f32; 2], mut shift: [f32; 2]) -> Option<[f32; 2]> {
-    let mut square = from.square(at);
+fn step_by_step(from: &Plane, to: &Plane, at: [f32; 2], mut shift: [f32; 2], spacing_px: f32) -> Option<[f32; 2]> {
+    let mut square = from.square(at, spacing_px);
     center(&mut square);
-    let half = |plane: &Plane, by: [f32; 2]| plane.square([at[0] + by[0], at[1] + by[1]]);
-    let (right, left) = (half(from, [0.5, 0.0]), half(from, [-0.5, 0.0]));
-    let (below, above) = (half(from, [0.0, 0.5]), half(from, [0.0, -0.5]));
+    let half_px = 0.5 * spacing_px;
+    let beside = |by: [f32; 2]| from.square([at[0] + by[0], at[1] + by[1]], spacing_px);
+    let (right, left) = (beside([half_px, 0.0]), beside([-half_px, 0.0]));
+    let (below, above) = (beside([0.0, half_px]), beside([0.0, -half_px]));
     let mut x: [f32; SIDE_PX * SIDE_PX] = std::array::from_fn(|i| right[i] - left[i]);
     let mut y: [f32; SIDE_PX * SIDE_PX] = std::array::from_fn(|i| below[i] - above[i]);
     center(&mut x);
@@ -275,7 +342,7 @@ fn step_by_step(from: &Plane, to: &Plane, at: [f32; 2], mut shift: [f32; 2]) -> 
         return None;
     }
     for _ in 0..MOST_STEPS {
-        let mut there = to.square([at[0] + shift[0], at[1] + shift[1]]);
+        let mut there = to.square([at[0] + shift[0], at[1] + shift[1]], 1.0);
         center(&mut there);
         let gain = dot(&there, &square) / dot(&square, &square);
         if gain < LEAST_GAIN {
@@ -292,9 +359,9 @@ fn step_by_step(from: &Plane, to: &Plane, at: [f32; 2], mut shift: [f32; 2]) -> 
     shift.iter().all(|s| s.is_finite()).then_some(shift)
 }
 
-/// Of the squares around two places.
-fn correlation(one: &Plane, at: [f32; 2], other: &Plane, there: [f32; 2]) -> f32 {
-    let (mut a, mut b) = (one.square(at), other.square(there));
+/// Of two squares.
+fn correlation(one: &[f32; SIDE_PX * SIDE_PX], other: &[f32; SIDE_PX * SIDE_PX]) -> f32 {
+    let (mut a, mut b) = (*one, *other);
     center(&mut a);
     center(&mut b);
     dot(&a, &b) / (dot(&a, &a) * dot(&b, &b)).sqrt().max(f32::MIN_POSITIVE)
@@ -377,6 +444,40 @@ mod tests {
         let kept = second.iter().filter(|there| first.iter().any(|here| here.point == there.point)).count();
         assert!(kept < first.len() / 10, "{kept} of {}", first.len());
         assert!(follower.take(&vec![80.0; WIDE_ROWS * WIDE_COLUMNS], 0.0).is_empty());
+    }
+
+    #[test]
+    fn what_another_pass_sees_from_nearer_by_is_found_where_it_is_thought_to_be() {
+        // Five blobs about a place, so many times as large.
+        let image = |middle_px: f32, larger: f32| {
+            let blobs =
+                [[-3.0, -2.0, 70.0], [3.0, 1.0, 60.0], [0.0, 3.0, -60.0], [3.0, -4.0, -50.0], [-4.0, 3.0, 40.0]];
+            let value = |i: usize| {
+                let at =
+                    [(i % WIDE_COLUMNS) as f32 - middle_px, (i / WIDE_COLUMNS) as f32 - 60.0].map(|px| px / larger);
+                let of_blob =
+                    |&[x, y, height]: &[f32; 3]| height * (-((at[0] - x).powi(2) + (at[1] - y).powi(2)) / 6.0).exp();
+                120.0 + blobs.iter().map(of_blob).sum::<f32>()
+            };
+            let wide: Vec<f32> = (0..WIDE_ROWS * WIDE_COLUMNS).map(value).collect();
+            wide
+        };
+        for azimuth in [AzimuthSense::Ccw, AzimuthSense::Cw] {
+            let [there, here] = [image(100.0, 1.0), image(400.0, 1.6)].map(|wide| KeptImage::new(&wide, azimuth));
+            let wanted = Wanted {
+                azimuth_rad: azimuth_rad(100.0, azimuth),
+                height_px: 60.0,
+                thought_rad: azimuth_rad(394.0, azimuth),
+                farther: 1.0 / 1.6,
+            };
+            let elsewhere = Wanted { thought_rad: azimuth_rad(250.0, azimuth), ..wanted };
+            let as_large = Wanted { farther: 1.0, ..wanted };
+            let found = here.find(&there, &[wanted, elsewhere, as_large]);
+            let off_px = |rad: Option<f64>| Some(shorter_way_px(columns_px(rad?, azimuth) - 400.0).abs());
+            assert!(off_px(found[0]).is_some_and(|off_px| off_px < 0.2), "{found:?}");
+            assert!(off_px(found[2]).is_none_or(|off_px| off_px > 0.3), "{found:?}");
+            assert_eq!(found[1], None);
+        }
     }
 
     #[test]

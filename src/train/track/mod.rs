@@ -9,8 +9,8 @@
 //! - *points* of the scene, [followed](follow) from frame to frame, are where their [`bearings`] meet: how the frames of a
 //!   stretch lie to each other, to a few centimetres a step;
 //! - the *vehicle* moves where it is headed and changes its speed slowly ([`motion`]);
-//! - a place seen on another *pass* – lap, direction, recording – looks as it did ([`views`]), across recordings too, each
-//!   of which has its own receiver error, its own time and its own noise.
+//! - a place seen on another *pass* – lap, direction, recording – looks as it did ([`views`]), and shows the same points
+//!   ([`across`]): across recordings too, each of which has its own receiver error, its own time and its own noise.
 //!
 //! How large the errors are is estimated from each recording by itself. A recording that is no track – without yaw or time,
 //! photographs at random headings, a lattice – is left as it is.
@@ -19,6 +19,7 @@
 //! images are learned from; images are compared, and bearings taken, only from the frames that are learned from. Points
 //! are followed through all frames, but what lies between two frames says nothing of a frame's own position.
 
+mod across;
 mod adjust;
 mod bearings;
 mod follow;
@@ -28,10 +29,11 @@ mod views;
 
 use std::ops::Range;
 
+use across::Across;
 use adjust::{Equation, Solution};
 pub use bearings::PointTrack;
 use bearings::{Frames, Meetings};
-pub use follow::{PointFollower, Sighting};
+pub use follow::{KeptImage, PointFollower, Sighting};
 use motion::{Track, TrackPoint, Unknowns};
 pub use views::Similarity;
 
@@ -65,6 +67,8 @@ pub struct TrackSmoother {
     spacing_m: f64,
     yaw_rad: Vec<f64>,
     points: Vec<PointTrack>,
+    /// Of every row, where points were followed.
+    images: Vec<Option<KeptImage>>,
 }
 
 /// One recording: its frames, and the track they are if they are one.
@@ -106,7 +110,8 @@ impl TrackSmoother {
             .map(|(frame, &position_m)| TrackPoint { position_m, yaw_rad: frame.yaw_rad, time_s: frame.time_s })
             .collect();
         let recording: Vec<usize> = survey.frames.iter().map(|frame| frame.recording).collect();
-        Self { points: survey.points().to_vec(), ..Self::of_points(&points, &recording) }
+        let (seen, images) = (survey.points().to_vec(), survey.images().to_vec());
+        Self { points: seen, images, ..Self::of_points(&points, &recording) }
     }
 
     /// `recording` rises.
@@ -120,7 +125,8 @@ impl TrackSmoother {
         let positions_m: Vec<PositionM> = points.iter().map(|point| point.position_m).collect();
         let spacing_m = median_neighbour_spacing_m(&positions_m, recording);
         let yaw_rad = points.iter().map(|point| point.yaw_rad.unwrap_or(0.0)).collect();
-        Self { positions_m, recording: recording.to_vec(), tracks, spacing_m, yaw_rad, points: Vec::new() }
+        let images = vec![None; points.len()];
+        Self { positions_m, recording: recording.to_vec(), tracks, spacing_m, yaw_rad, points: Vec::new(), images }
     }
 
     /// The most likely positions when images may be compared among the frames `learned`, in rising order.
@@ -158,8 +164,9 @@ impl TrackSmoother {
         }
     }
 
-    /// By motion alone first, which shows whether points are where bearings meet; with these; and then with other passes,
-    /// which are looked for where the bearings say.
+    /// By motion alone first, which shows whether points are where bearings meet; with these; then with other passes, which
+    /// are looked for where the bearings say; and last with the points that passes share, which are looked for where all of
+    /// that says.
     fn adjusted(
         &self,
         layout: &Layout,
@@ -170,21 +177,39 @@ impl TrackSmoother {
         let seeing = self.seeing(layout, learned, &by_motion);
         let used: Vec<usize> = learned.iter().copied().filter(|&row| seeing.contains(&self.recording[row])).collect();
         let mut equations = self.equations(layout, &seeing);
-        let solution = self.refined(layout, &equations, &used, by_motion)?;
-        let Some(similarity) = similarity else { return Some((solution, Vec::new())) };
+        let mut solution = self.refined(layout, &equations, &used, &[], by_motion)?;
+        let mut views = Vec::new();
+        if let Some(similarity) = similarity {
+            let rows: Vec<usize> = learned.iter().copied().filter(|&row| layout.first[row].is_some()).collect();
+            views = self.passes(layout, &self.corrected(layout, &solution.unknowns), &rows).views(similarity);
+            equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
+            solution = self.refined(layout, &equations, &used, &[], solution)?;
+        }
+        let joined = self.joined(layout, &used, &solution);
+        if !joined.is_empty() {
+            solution = self.refined(layout, &equations, &used, &joined, solution)?;
+        }
+        Some((solution, views))
+    }
 
-        let rows: Vec<usize> = learned.iter().copied().filter(|&row| layout.first[row].is_some()).collect();
+    fn passes<'a>(&'a self, layout: &Layout, positions_m: &'a [PositionM], rows: &'a [usize]) -> Passes<'a> {
         let receiver_std_m = layout.found.iter().map(|(_, track)| track.noise.receiver_std_m).fold(0.0, f64::max);
-        let passes = Passes {
-            positions_m: &self.corrected(layout, &solution.unknowns),
+        Passes {
+            positions_m,
             recording: &self.recording,
-            rows: &rows,
+            rows,
             reach_m: REACH_SPACINGS * self.spacing_m + REACH_DEVIATIONS * receiver_std_m,
             spacing_m: self.spacing_m,
-        };
-        let views = passes.views(similarity);
-        equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
-        Some((self.refined(layout, &equations, &used, solution)?, views))
+        }
+    }
+
+    /// The points that different passes among the frames `used` share.
+    fn joined(&self, layout: &Layout, used: &[usize], solution: &Solution) -> Vec<PointTrack> {
+        let positions_m = self.corrected(layout, &solution.unknowns);
+        let yaw_errors_rad = layout.yaw_errors_rad(&solution.unknowns);
+        let frames = &self.frames(layout, &positions_m, &yaw_errors_rad, 1.0);
+        let across = Across { frames, points: &self.points, images: &self.images, rows: used };
+        across.joined(&self.passes(layout, &positions_m, used).pairs())
     }
 
     /// Of every row: the mean over a recording's frames that are `learned`, or over its others.
@@ -247,13 +272,14 @@ impl TrackSmoother {
         }
     }
 
-    /// Weighs `equations`, and takes bearings from the frames `learned`, about the positions so far, a round for each of
-    /// [`LOOSENINGS`].
+    /// Weighs `equations`, and takes bearings from the frames `learned`, those of points that passes share too, about the
+    /// positions so far, a round for each of [`LOOSENINGS`].
     fn refined(
         &self,
         layout: &Layout,
         equations: &[Equation],
         learned: &[usize],
+        joined: &[PointTrack],
         mut solution: Solution,
     ) -> Option<Solution> {
         let is_used = |row: usize| layout.first[row].is_some() && learned.binary_search(&row).is_ok();
@@ -261,9 +287,9 @@ impl TrackSmoother {
             let positions_m = self.corrected(layout, &solution.unknowns);
             let yaw_errors_rad = layout.yaw_errors_rad(&solution.unknowns);
             let frames = self.frames(layout, &positions_m, &yaw_errors_rad, loosening);
-            let bearings = frames.equations(&self.points, is_used);
+            let bearings = [&self.points, joined].map(|tracks| frames.equations(tracks, is_used));
             let mut all: Vec<Equation> = equations.iter().map(|e| e.about(&solution.unknowns)).collect();
-            all.extend(bearings);
+            all.extend(bearings.into_iter().flatten());
             solution = adjust::solve_about(&solution.unknowns, &all)?;
         }
         Some(solution)

@@ -1,11 +1,15 @@
 //! Tracks whose truth is known.
 
+use std::f64::consts::{PI, TAU};
+
 use faer::Mat;
-use rand::SeedableRng;
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::panorama::{WIDE_COLUMNS, WIDE_ROWS};
 use crate::train::perturbation::standard_normal;
+use crate::types::AzimuthSense;
 
 const RECEIVER_STD_M: f64 = 0.6;
 const RECEIVER_TIME_S: f64 = 20.0;
@@ -230,6 +234,7 @@ fn points(truth: &[(PositionM, f64)], turned_rad: f64) -> Vec<PointTrack> {
             near.map(|(number, point)| Sighting {
                 // On the next lap nobody knows it again.
                 point: 10 * number + i / 60,
+                height_px: 60.0,
                 azimuth_rad: (point[1] - at[1]).atan2(point[0] - at[0]) - yaw_rad + turned_rad + 0.005 * normal(),
             })
             .collect()
@@ -263,6 +268,80 @@ fn points_take_off_more_than_motion_and_nothing_where_the_camera_looks_elsewhere
     }
     let [by_motion, by_points] = sums;
     assert!(by_points < 0.85 * by_motion, "{by_points} of {by_motion}");
+}
+
+/// What a camera sees from `at`: blobs of 0.3 m east, north and above it, so bright.
+fn panorama(scene: &[[f64; 4]], (at, yaw_rad): (PositionM, f64)) -> Vec<f32> {
+    let columns_a_rad = WIDE_COLUMNS as f64 / TAU;
+    let mut wide = vec![120.0_f32; WIDE_ROWS * WIDE_COLUMNS];
+    for &[east_m, north_m, above_m, bright] in scene {
+        let to = [east_m - at[0], north_m - at[1]];
+        let distance_m = to[0].hypot(to[1]);
+        let column = (to[1].atan2(to[0]) - yaw_rad) * columns_a_rad;
+        let row = 60.0 - (above_m / distance_m).atan() * columns_a_rad;
+        let size_px = 0.3 / distance_m * columns_a_rad;
+        let reach_px = (4.0 * size_px).ceil() as i64;
+        for x in column.round() as i64 - reach_px..=column.round() as i64 + reach_px {
+            for y in (row.round() as i64 - reach_px).max(0)..=(row.round() as i64 + reach_px).min(WIDE_ROWS as i64 - 1)
+            {
+                let apart_px = (x as f64 - column).hypot(y as f64 - row);
+                wide[y as usize * WIDE_COLUMNS + x.rem_euclid(WIDE_COLUMNS as i64) as usize] +=
+                    (bright * (-0.5 * (apart_px / size_px).powi(2)).exp()) as f32;
+            }
+        }
+    }
+    wide
+}
+
+#[test]
+fn points_that_two_lanes_share_tie_them_across_the_street() {
+    // Lanes that are 3 m apart, the second the other way, and houses to either side.
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let mut share = || f64::from(random.random::<f32>());
+    let scene: Vec<[f64; 4]> = (0..250)
+        .map(|k| {
+            let beside_m = 1.5 + (5.0 + 6.0 * share()) * if k % 2 == 0 { 1.0 } else { -1.0 };
+            [100.0 * share() - 20.0, beside_m, 6.0 * share() - 1.5, 100.0 * share() - 50.0]
+        })
+        .collect();
+    let there = (0..40).map(|i| ([1.5 * f64::from(i), 0.0], 0.0));
+    let back = (0..40).map(|i| ([60.0 - 1.5 * f64::from(i), 3.0], PI));
+    let truth: Vec<(PositionM, f64)> = there.chain(back).collect();
+    let (images, sightings): (Vec<Vec<f32>>, Vec<Vec<Sighting>>) = {
+        let mut follower = PointFollower::new(AzimuthSense::Ccw);
+        let seen = truth.iter().enumerate().map(|(i, &at)| {
+            if i == 40 {
+                follower = PointFollower::new(AzimuthSense::Ccw);
+            }
+            let wide = panorama(&scene, at);
+            let sightings = follower.take(&wide, at.1);
+            (wide, sightings)
+        });
+        seen.unzip()
+    };
+    // The receivers see them 1.4 m apart.
+    let mut points = [received(&truth[..40], 1, 0.0), received(&truth[40..], 2, 0.0)].concat();
+    for (row, point) in points.iter_mut().enumerate() {
+        point.position_m[1] += if row < 40 { 0.8 } else { -0.8 };
+    }
+    let recording: Vec<usize> = (0..80).map(|row| row / 40).collect();
+    let untied = TrackSmoother {
+        points: [PointTrack::gather(0, &sightings[..40]), PointTrack::gather(40, &sightings[40..])].concat(),
+        ..TrackSmoother::of_points(&points, &recording)
+    };
+    let images = images.iter().map(|wide| Some(KeptImage::new(wide, AzimuthSense::Ccw))).collect();
+    let tied = TrackSmoother { images, ..untied.clone() };
+    let off_m = |smoother: &TrackSmoother, learned: &[usize]| {
+        let positions_m = smoother.smoothed(learned, None).positions_m;
+        let beside = |row: usize| positions_m[79 - row][1] - positions_m[row + 1][1] - 3.0;
+        ((1..39).map(|row| beside(row).powi(2)).sum::<f64>() / 38.0).sqrt()
+    };
+    let everything: Vec<usize> = (0..80).collect();
+    let (untied_m, tied_m) = (off_m(&untied, &everything), off_m(&tied, &everything));
+    assert!(untied_m > 1.0 && tied_m < 0.15, "{untied_m} {tied_m}");
+    // What is not learned from is not looked at.
+    let one_lane: Vec<usize> = (0..40).collect();
+    assert_eq!(off_m(&tied, &one_lane), off_m(&untied, &one_lane));
 }
 
 #[test]

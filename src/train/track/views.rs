@@ -2,7 +2,7 @@
 //!
 //! The place of a frame along another pass of the same street – another lap, the other direction, another day – is found
 //! by its image. Across the street the image says little where there is only one line of images to compare with, and
-//! nothing is made of it; across the street, the yaw holds the track together.
+//! nothing is made of it; across the street, the points that both see tie them together ([`across`](super::across)).
 //!
 //! Images are compared without regard to any position: in features learned from positions, images fit the positions they
 //! were learned from, and every match would confirm the error it was to find.
@@ -82,6 +82,14 @@ const STD_FACTOR: f64 = 2.0;
 const MIN_STD_SPACINGS: f64 = 0.1;
 
 impl Passes<'_> {
+    /// Every frame with the nearest one of every other pass.
+    pub fn pairs(&self) -> Vec<(usize, usize)> {
+        let way_m = self.way_m();
+        let of_frame =
+            |&frame: &usize| self.others(frame, &way_m).into_iter().map(move |nearest| (frame, self.rows[nearest]));
+        self.rows.iter().flat_map(of_frame).collect()
+    }
+
     /// All matches of frames with other passes.
     pub fn views(&self, similarity: &Similarity) -> Vec<View> {
         let way_m = self.way_m();
