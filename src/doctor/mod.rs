@@ -100,7 +100,7 @@ pub fn examine(purpose: &Purpose, mut each: impl FnMut(Finding)) -> anyhow::Resu
     };
 
     let known = vehicle.calibration.as_deref().map(read_calibration).transpose();
-    let mut expected = Expected::Calibration(known.unwrap_or_else(|error| {
+    let mut expected = camera::Expected::Calibration(known.unwrap_or_else(|error| {
         let advice = "`omniloc calibrate` makes one; without the key nothing is calibrated yet";
         tell(vec![Finding::problem("calibration", format!("{error:#}"), advice)]);
         None
@@ -110,7 +110,7 @@ pub fn examine(purpose: &Purpose, mut each: impl FnMut(Finding)) -> anyhow::Resu
             Ok(map) => {
                 let cells = map.cells.len();
                 tell(of_map(&config.map.file, cells, &map.info, config.outputs.has_nmea()));
-                expected = Expected::Map(Box::new(map.info));
+                expected = camera::Expected::Map(Box::new(map.info));
             }
             Err(error) => {
                 let advice = "copy it there again, or train it: omniloc train REC --out AREA.map";

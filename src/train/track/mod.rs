@@ -24,6 +24,7 @@ mod adjust;
 mod bearings;
 mod follow;
 mod motion;
+mod receiver;
 mod skyline;
 mod views;
 
@@ -35,6 +36,7 @@ pub use bearings::PointTrack;
 use bearings::{Frames, Meetings};
 pub use follow::{KeptImage, PointFollower, Sighting};
 use motion::{Track, TrackPoint, Unknowns};
+use receiver::Receiver;
 pub use views::Similarity;
 
 use super::survey::Survey;
@@ -89,6 +91,13 @@ pub struct Smoothed {
     pub reports: Vec<TrackReport>,
 }
 
+struct Adjusted {
+    /// With the noise that all was solved with in the end.
+    tracks: Vec<RecordingTrack>,
+    solution: Solution,
+    views: Vec<View>,
+}
+
 impl Similarity {
     /// Of all frames of `survey`, by the shortest descriptor whose reaction to perturbations `recipe` has. `None` where it
     /// has none.
@@ -133,7 +142,7 @@ impl TrackSmoother {
     pub fn smoothed(&self, learned: &[usize], similarity: Option<&Similarity>) -> Smoothed {
         let layout = Layout::new(&self.tracks, self.positions_m.len());
         let adjusted = if layout.found.is_empty() { None } else { self.adjusted(&layout, learned, similarity) };
-        let Some((solution, views)) = adjusted else { return self.left_alone() };
+        let Some(Adjusted { tracks, solution, views }) = adjusted else { return self.left_alone() };
 
         let positions_m = self.corrected(&layout, &solution.unknowns);
         let remaining_std_m = self.remaining_std_m(&layout, learned, &solution);
@@ -152,7 +161,7 @@ impl TrackSmoother {
                 }
             }
         };
-        Smoothed { reports: self.tracks.iter().map(report).collect(), remaining_std_m, positions_m }
+        Smoothed { reports: tracks.iter().map(report).collect(), remaining_std_m, positions_m }
     }
 
     fn left_alone(&self) -> Smoothed {
@@ -165,14 +174,9 @@ impl TrackSmoother {
     }
 
     /// By motion alone first, which shows whether points are where bearings meet; with these; then with other passes, which
-    /// are looked for where the bearings say; and last with the points that passes share, which are looked for where all of
-    /// that says.
-    fn adjusted(
-        &self,
-        layout: &Layout,
-        learned: &[usize],
-        similarity: Option<&Similarity>,
-    ) -> Option<(Solution, Vec<View>)> {
+    /// are looked for where the bearings say; and with the points that passes share, which are looked for where all of that says.
+    /// Then it is known, but for the mean, how the receivers err, and all is solved with that.
+    fn adjusted(&self, layout: &Layout, learned: &[usize], similarity: Option<&Similarity>) -> Option<Adjusted> {
         let by_motion = adjust::solve(layout.count, &self.equations(layout, &[]))?;
         let seeing = self.seeing(layout, learned, &by_motion);
         let used: Vec<usize> = learned.iter().copied().filter(|&row| seeing.contains(&self.recording[row])).collect();
@@ -189,7 +193,29 @@ impl TrackSmoother {
         if !joined.is_empty() {
             solution = self.refined(layout, &equations, &used, &joined, solution)?;
         }
-        Some((solution, views))
+        let tracks = self.with_receivers(layout, &seeing, &solution);
+        let layout = &Layout::new(&tracks, self.positions_m.len());
+        let mut equations = self.equations(layout, &seeing);
+        equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
+        solution = self.refined(layout, &equations, &used, &joined, solution)?;
+        Some(Adjusted { tracks, solution, views })
+    }
+
+    /// The tracks, with receivers as the errors of the recordings `seeing` show them.
+    fn with_receivers(&self, layout: &Layout, seeing: &[usize], solution: &Solution) -> Vec<RecordingTrack> {
+        let mut tracks = self.tracks.clone();
+        for RecordingTrack { rows, track } in &mut tracks {
+            let Ok(track) = track else { continue };
+            if !seeing.contains(&self.recording[rows.start]) {
+                continue;
+            }
+            let of_row = |first: &Option<usize>| first.map(|first| [0, 1].map(|axis| solution.unknowns[first + axis]));
+            let error_m: Vec<[f64; 2]> = layout.first[rows.clone()].iter().filter_map(of_row).collect();
+            if let Some(receiver) = Receiver::of_errors(&track.time_s, &error_m) {
+                (track.noise.receiver_std_m, track.noise.receiver_time_s) = (receiver.std_m, receiver.time_s);
+            }
+        }
+        tracks
     }
 
     fn passes<'a>(&'a self, layout: &Layout, positions_m: &'a [PositionM], rows: &'a [usize]) -> Passes<'a> {
