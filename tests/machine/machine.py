@@ -1,7 +1,8 @@
 """A Raspberry Pi that is not there: QEMU's aarch64 machine, its plugs and switches, and commands inside it.
 
 What the machine boots is made by tests/machine/image. Commands run through QEMU's guest agent, plugs and the power switch
-through QEMU's monitor; both speak JSON over a socket.
+through QEMU's monitor; both speak JSON over a socket. Its pins are behind QEMU's test line, which reaches memory and
+interrupts from outside.
 """
 
 import base64
@@ -19,19 +20,19 @@ class Failure(Exception):
     """Something that the test looks at is not as it should be, or the machine does not do what it is told."""
 
 
-class Conversation:
-    """JSON, one object a line, over a socket of QEMU's."""
+class Lines:
+    """One line of text after the other, over a socket of QEMU's."""
 
     def __init__(self, path: Path):
         self.socket = socket.socket(socket.AF_UNIX)
         self.socket.connect(str(path))
         self.unread = b""
 
-    def say(self, message: dict) -> None:
-        self.socket.sendall(json.dumps(message).encode() + b"\n")
+    def say_line(self, line: str) -> None:
+        self.socket.sendall(line.encode() + b"\n")
 
-    def hear(self, timeout_s: float) -> dict | None:
-        """The next object, or nothing within this time."""
+    def hear_line(self, timeout_s: float) -> str | None:
+        """The next line, or nothing within this time."""
         deadline_s = time.monotonic() + timeout_s
         while b"\n" not in self.unread:
             left_s = deadline_s - time.monotonic()
@@ -45,10 +46,22 @@ class Conversation:
                 raise Failure("the machine went off")
             self.unread += received
         line, self.unread = self.unread.split(b"\n", 1)
-        return json.loads(line)
+        return line.decode()
 
     def close(self) -> None:
         self.socket.close()
+
+
+class Conversation(Lines):
+    """JSON, one object a line."""
+
+    def say(self, message: dict) -> None:
+        self.say_line(json.dumps(message))
+
+    def hear(self, timeout_s: float) -> dict | None:
+        """The next object, or nothing within this time."""
+        line = self.hear_line(timeout_s)
+        return None if line is None else json.loads(line)
 
 
 class Monitor(Conversation):
@@ -134,6 +147,74 @@ class Agent(Conversation):
         return there_ns, here_s
 
 
+class Header(Lines):
+    """The pins of a Raspberry Pi 4, from outside: behind the registers that the kernel's driver and the program write.
+
+    Registers are memory, see pins.dts: nothing happens by itself when one is written, and it keeps what was written. For a
+    press the level goes into its register and the edge into that of events, and then the interrupt is raised, as the
+    hardware would; what was written last to set or clear an output stays until it is wiped here.
+    """
+
+    # "BCM2711 ARM Peripherals", 5.2.
+    ADDRESS = 0x7FF0_0000
+    FUNCTIONS, SET, CLEAR, LEVELS, EVENTS, RISING, FALLING, PULLS = 0x00, 0x1C, 0x28, 0x34, 0x40, 0x4C, 0x58, 0xE4
+    OUTPUT, PULLED_UP, PULLED_DOWN = 1, 1, 2
+    INTERRUPT = 113
+
+    def __init__(self, path: Path, interrupts: str):
+        """`interrupts`: the controller, as QEMU calls it."""
+        super().__init__(path)
+        self.interrupts = interrupts
+
+    def ask(self, command: str) -> str:
+        self.say_line(command)
+        answer = self.hear_line(30)
+        if answer is None or not answer.startswith("OK"):
+            raise Failure(f"QEMU does not do {command}: {answer}")
+        return answer.removeprefix("OK").strip()
+
+    def read(self, register: int) -> int:
+        return int(self.ask(f"readl {self.ADDRESS + register:#x}"), 16)
+
+    def write(self, register: int, value: int) -> None:
+        self.ask(f"writel {self.ADDRESS + register:#x} {value:#x}")
+
+    def function(self, pin: int) -> int:
+        return self.read(self.FUNCTIONS + 4 * (pin // 10)) >> 3 * (pin % 10) & 7
+
+    def pull(self, pin: int) -> int:
+        return self.read(self.PULLS + 4 * (pin // 16)) >> 2 * (pin % 16) & 3
+
+    def put(self, pin: int, high: bool) -> None:
+        """Puts an input on a level. The kernel's driver hears of it if it watches such edges."""
+        bit, levels = 1 << pin, self.read(self.LEVELS)
+        self.write(self.LEVELS, levels | bit if high else levels & ~bit)
+        if self.read(self.RISING if high else self.FALLING) & bit:
+            self.write(self.EVENTS, bit)
+            for level in (1, 0):
+                self.ask(f"set_irq_in {self.interrupts} unnamed-gpio-in {self.INTERRUPT} {level}")
+
+    def is_set(self, pin: int) -> bool:
+        """Whether somebody has driven an output high since this was wiped."""
+        return bool(self.read(self.SET) >> pin & 1)
+
+    def is_cleared(self, pin: int) -> bool:
+        """The same for low."""
+        return bool(self.read(self.CLEAR) >> pin & 1)
+
+    def is_driven_high(self, pin: int) -> bool:
+        """To which level somebody drives an output, who writes it again and again; wipes what was written before."""
+        for _ in range(100):
+            self.write(self.SET, 0)
+            self.write(self.CLEAR, 0)
+            time.sleep(0.05)
+            is_set = self.is_set(pin)
+            # Both: it changed meanwhile.
+            if is_set != self.is_cleared(pin):
+                return is_set
+        raise Failure(f"pin {pin} is driven by nobody")
+
+
 class Machine:
     """One machine with one disk, which keeps what is on it from one start to the next.
 
@@ -142,6 +223,7 @@ class Machine:
     """
 
     BOOT_LIMIT_S = 400
+    QEMU = "qemu-system-aarch64 -nodefaults -display none -machine virt,gic-version=3 -cpu cortex-a53 -smp 2 -m 1024".split()
 
     def __init__(self, image: Path, folder: Path, receiver: str, port: int):
         self.image, self.folder, self.receiver, self.port = image, folder, receiver, port
@@ -150,21 +232,34 @@ class Machine:
         self.disk = folder / "disk.qcow2"
         create = ["qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", str(image / "root.img"), str(self.disk)]
         subprocess.run(create, check=True)
+        self.tree = folder / "pi.dtb"
+        self.describe()
+
+    def describe(self) -> None:
+        """Makes the device tree: QEMU's own, and what pins.dts makes of it."""
+        own = self.folder / "qemu.dtb"
+        subprocess.run([*self.QEMU, "-machine", f"dumpdtb={own}"], check=True, capture_output=True)
+        source = subprocess.run(["dtc", "-q", "-I", "dtb", "-O", "dts", str(own)], check=True, capture_output=True).stdout
+        source += Path(__file__).with_name("pins.dts").read_bytes()
+        subprocess.run(["dtc", "-q", "-I", "dts", "-O", "dtb", "-o", str(self.tree)], input=source, check=True)
 
     def power_on(self, plugged: bool) -> None:
         """Switches it on, with camera and receiver there from the start or not, and waits until it takes commands."""
-        for name in ("agent", "monitor", "pictures"):
+        for name in ("agent", "monitor", "pins", "pictures"):
             (self.folder / name).unlink(missing_ok=True)
         kernel = "console=ttyAMA0 quiet panic=-1 systemd.show_status=0 net.ifnames=0"
+        # The last MiB of the memory is not the kernel's, but the registers of the pins; no text is to be shown in them.
+        kernel += " mem=1023M fbcon=map:9"
         if plugged:
             kernel += " modules_load=vivid,ftdi_sio"
         command = [
-            *"qemu-system-aarch64 -machine virt,gic-version=3 -cpu cortex-a53 -smp 2 -m 1024".split(),
-            *"-accel tcg,thread=multi".split(),
-            *"-nodefaults -display none -no-reboot".split(),
+            *self.QEMU,
+            *"-accel tcg,thread=multi -no-reboot".split(),
             *("-serial", f"file:{self.folder}/console.log"),
             *("-kernel", f"{self.image}/vmlinuz", "-initrd", f"{self.image}/initrd.gz", "-append", kernel),
+            *("-dtb", str(self.tree)),
             *("-qmp", f"unix:{self.folder}/monitor,server=on,wait=off"),
+            *("-qtest", f"unix:{self.folder}/pins,server=on,wait=off", "-qtest-log", "none"),
             *("-drive", f"if=none,id=disk,file={self.disk},format=qcow2,cache=writeback"),
             *("-device", "virtio-blk-pci,drive=disk"),
             *("-netdev", f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-10.0.2.15:10110"),
@@ -182,12 +277,15 @@ class Machine:
         self.powered_on_s = time.monotonic()
         with open(self.folder / "qemu.log", "ab") as log:
             self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        while not (self.folder / "agent").exists() or not (self.folder / "monitor").exists():
+        while not all((self.folder / name).exists() for name in ("agent", "monitor", "pins")):
             if self.process.poll() is not None:
                 raise Failure(f"QEMU ended: {(self.folder / 'qemu.log').read_text()}")
             time.sleep(0.05)
         self.monitor = Monitor(self.folder / "monitor")
         self.agent = Agent(self.folder / "agent")
+        parts = self.monitor.ask("qom-list", path="/machine/unattached")
+        interrupts = next(part["name"] for part in parts if part["type"] == "child<arm-gicv3>")
+        self.header = Header(self.folder / "pins", f"/machine/unattached/{interrupts}")
         self.agent.wait_until_up(self.BOOT_LIMIT_S)
 
     def power_off(self) -> None:
@@ -195,8 +293,11 @@ class Machine:
         if self.process and self.process.poll() is None:
             self.process.kill()
             self.process.wait()
-            self.agent.close()
-            self.monitor.close()
+            self.hang_up()
+
+    def hang_up(self) -> None:
+        for line in (self.agent, self.monitor, self.header):
+            line.close()
 
     def shut_down(self) -> None:
         """As `poweroff` does."""
@@ -204,8 +305,7 @@ class Machine:
         with contextlib.suppress(Failure):
             self.sh("systemctl poweroff --no-block")
         self.process.wait(timeout=120)
-        self.agent.close()
-        self.monitor.close()
+        self.hang_up()
 
     def plug_receiver(self) -> None:
         self.monitor.ask("device_add", driver="usb-serial", chardev="receiver", id="receiver")
