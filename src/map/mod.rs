@@ -78,8 +78,8 @@ pub struct MapInfo {
     /// p(cell) ∝ exp(log-likelihood / temperature): learned from frames that were held back, whole recordings of them
     /// where there are several.
     pub temperature: f64,
-    /// How many times as wide as the map's own the gaps between learning images were in which the temperature was learned.
-    /// Errors grow with them: the variance of what a frame says of its place is divided by the square.
+    /// How many times as much as in the map's own gaps between learning images frames err in those in which the temperature was
+    /// learned: the variance of what a frame says of its place is divided by the square.
     pub gap_ratio: f64,
     /// Frames that resemble their best cell less than this for a while are of no place in the map: how much likelier it is
     /// than no place, in nats at the map's temperature. `None` where the map cannot tell.
