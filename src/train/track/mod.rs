@@ -92,9 +92,9 @@ pub struct Smoothed {
 }
 
 struct Adjusted {
-    /// With the noise that all was solved with in the end.
-    tracks: Vec<RecordingTrack>,
     solution: Solution,
+    /// The tracks with the noise that their receivers may have, and what is known with that.
+    doubted: (Vec<RecordingTrack>, Solution),
     views: Vec<View>,
 }
 
@@ -142,10 +142,10 @@ impl TrackSmoother {
     pub fn smoothed(&self, learned: &[usize], similarity: Option<&Similarity>) -> Smoothed {
         let layout = Layout::new(&self.tracks, self.positions_m.len());
         let adjusted = if layout.found.is_empty() { None } else { self.adjusted(&layout, learned, similarity) };
-        let Some(Adjusted { tracks, solution, views }) = adjusted else { return self.left_alone() };
+        let Some(Adjusted { solution, doubted: (tracks, doubted), views }) = adjusted else { return self.left_alone() };
 
         let positions_m = self.corrected(&layout, &solution.unknowns);
-        let remaining_std_m = self.remaining_std_m(&layout, learned, &solution);
+        let remaining_std_m = self.remaining_std_m(&layout, learned, &doubted);
         let report = |of: &RecordingTrack| match &of.track {
             Err(why) => TrackReport::LeftAlone(*why),
             Ok(track) => {
@@ -175,7 +175,8 @@ impl TrackSmoother {
 
     /// By motion alone first, which shows whether points are where bearings meet; with these; then with other passes, which
     /// are looked for where the bearings say; and with the points that passes share, which are looked for where all of that says.
-    /// Then it is known, but for the mean, how the receivers err, and all is solved with that.
+    /// Then it is known, but for the mean, how the receivers err. How far off the mean may be follows from that; the positions
+    /// stay, which stiffer receivers suit better.
     fn adjusted(&self, layout: &Layout, learned: &[usize], similarity: Option<&Similarity>) -> Option<Adjusted> {
         let by_motion = adjust::solve(layout.count, &self.equations(layout, &[]))?;
         let seeing = self.seeing(layout, learned, &by_motion);
@@ -197,8 +198,8 @@ impl TrackSmoother {
         let layout = &Layout::new(&tracks, self.positions_m.len());
         let mut equations = self.equations(layout, &seeing);
         equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
-        solution = self.refined(layout, &equations, &used, &joined, solution)?;
-        Some(Adjusted { tracks, solution, views })
+        let doubted = self.refined(layout, &equations, &used, &joined, solution.clone())?;
+        Some(Adjusted { solution, doubted: (tracks, doubted), views })
     }
 
     /// The tracks, with receivers as the errors of the recordings `seeing` show them.
