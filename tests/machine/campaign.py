@@ -543,6 +543,19 @@ def localize(machine: Machine, map_file: Path, pictures: Pictures) -> None:
     check(machine.property(LOCALIZE, "ActiveState") == "inactive", f"{LOCALIZE} is off while {RECORD} is on")
 
 
+def remove(machine: Machine) -> None:
+    begin("the package again, removed, and purged")
+    before = segments(machine)
+    machine.sh("DEBIAN_FRONTEND=noninteractive dpkg --install /root/omniloc.deb", 240)
+    check(machine.property(RECORD, "ActiveState") == "active", "what recorded before records on")
+    machine.sh("dpkg --remove omniloc", 120)
+    check(machine.try_sh(f"systemctl is-active {RECORD}")[0] != 0, "nothing records any more")
+    check(machine.try_sh(f"test -e {RECORD_CONFIG}")[0] == 0, "the configuration is kept")
+    machine.sh("dpkg --purge omniloc", 120)
+    check(machine.try_sh("test -e /etc/omniloc")[0] != 0, "the configuration is gone")
+    check(before <= segments(machine), f"no recording is gone: {before}")
+
+
 def drive(machine: Machine, package: Path, devices: Path, map_file: Path) -> str:
     """Everything once."""
     pictures = Pictures(devices, machine.folder)
@@ -567,6 +580,7 @@ def drive(machine: Machine, package: Path, devices: Path, map_file: Path) -> str
     examine_with_devices(machine)
     examine_refused(machine)
     localize(machine, map_file, pictures)
+    remove(machine)
     machine.shut_down()
     return "everything as it should be"
 

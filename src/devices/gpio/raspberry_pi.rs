@@ -103,7 +103,10 @@ fn fault(device: &str, error: Error) -> DeviceError {
         Error::PinUsed(_) => DeviceError::Busy { device },
         Error::PermissionDenied(path) => DeviceError::NotPermitted {
             device,
-            hint: format!("{path}: add the user to the group gpio, `sudo usermod -aG gpio USER`, and log in again"),
+            hint: format!(
+                "{path}: add the user to the group gpio, `sudo usermod -aG gpio USER`, and log in again; in a service of your \
+                 own, with [Service] and DeviceAllow={path} rw"
+            ),
         },
         Error::Io(source) => match source.kind() {
             std::io::ErrorKind::NotFound => DeviceError::NotPresent { device },
