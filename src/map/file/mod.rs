@@ -170,7 +170,7 @@ mod tests {
         let mut map = small_map();
         map.info.format_version = 7;
         let error = from_bytes(&to_bytes(&map)).expect_err("newer");
-        assert_eq!(error.to_string(), "map file is version 7, this build reads version 4: install a newer omniloc");
+        assert_eq!(error.to_string(), "map file is version 7, this build reads version 5: install a newer omniloc");
     }
 
     #[test]

@@ -103,12 +103,13 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
-    /// Many drives of three minutes with receivers that err by 0.6 m, alike for 20 or 60 s, known but for the mean.
+    /// Many drives of three minutes with receivers that err by 0.6 m, alike for 20 or 60 s, known but for the mean: its square is
+    /// three quarters of what is thought, drive by drive. That is the price of not knowing σ and τ.
     #[test]
-    fn a_mean_error_is_on_average_as_large_as_is_thought() {
+    fn a_mean_error_is_thought_as_large_as_it_is_or_a_little_larger() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let mut normal = || f64::from(standard_normal(&mut random));
-        let (mut thought_m2, mut true_m2, drives) = (0.0, 0.0, 60);
+        let (mut ratios, drives) = (0.0, 60);
         for drive in 0..drives {
             let correlation_s = if drive % 2 == 0 { 20.0 } else { 60.0 };
             let time_s: Vec<f64> = (0..360).map(|i| 0.5 * f64::from(i)).collect();
@@ -123,11 +124,11 @@ mod tests {
                 error_m.iter().map(|b| [0, 1].map(|k| b[k] - mean_m[k] + 0.05 * normal())).collect();
             let found = Receiver::of_errors(&time_s, &known_m).expect("enough errors");
             assert!((0.1..3.0).contains(&found.std_m), "{found:?}");
-            thought_m2 += 2.0 * found.std_m.powi(2) * Receiver::of_mean(found.time_s, 179.5);
-            true_m2 += mean_m[0].powi(2) + mean_m[1].powi(2);
+            let thought_m2 = 2.0 * found.std_m.powi(2) * Receiver::of_mean(found.time_s, 179.5);
+            ratios += (mean_m[0].powi(2) + mean_m[1].powi(2)) / thought_m2;
         }
-        let ratio = true_m2 / thought_m2;
-        assert!((0.6..1.5).contains(&ratio), "{ratio}");
+        let ratio = ratios / f64::from(drives);
+        assert!((0.5..1.1).contains(&ratio), "{ratio}");
     }
 
     #[test]
