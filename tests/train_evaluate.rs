@@ -288,7 +288,7 @@ fn damaged_foreign_and_missing_maps_are_refused() {
     for (case, content, expected) in [
         ("cut", &bytes[..bytes.len() / 2], "damaged"),
         ("flipped", &flipped, "checksum"),
-        ("newer", &of_future, "version 9, this build reads version 4"),
+        ("newer", &of_future, "version 9, this build reads version 5"),
         ("text", b"not a map at all", "not a map"),
         ("empty", b"", "not a map"),
     ] {
