@@ -38,7 +38,8 @@ fn a_camera_is_calibrated_a_drive_recorded_a_map_learned_and_another_drive_local
 
     let first = drive(&path("first"), "duration_s = 8.0", None);
     let donut = path("donut.json");
-    let (code, said, errors) = run(omniloc().arg("calibrate").args(&first).arg("--out").arg(&donut));
+    let (code, said, errors) =
+        run(omniloc().arg("calibrate").args(&first).arg("--out").arg(&donut).arg("--overlay").arg(path("donut.png")));
     assert!(code == 0 && said.contains("sure"), "{said}{errors}");
 
     // Several segments, of which the last is shorter.

@@ -3,7 +3,7 @@
 use crate::recording::Recording;
 use crate::types::{NS_PER_S, PositionM, distance_m};
 
-/// Recordings that began within this of each other saw the same light and the same parked cars \[s\].
+/// Recordings that began within this of the one before saw the same light and the same parked cars \[s\].
 const ONE_APPEARANCE_S: u64 = 3 * 3600;
 /// Log times before this count from when the computer was switched on, or from the first image: 2001-09-09.
 const FIRST_DATE_NS: u64 = 1_000_000_000 * NS_PER_S;

@@ -111,9 +111,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     progress.finish();
     let seen_once = share_seen_once(&recordings);
     if seen_once > MANY_SEEN_ONCE {
-        let place = match seen_once {
-            1.0 => "its place".into(),
-            share => format!("{:.0} % of its place", 100.0 * share),
+        let place = match (100.0 * seen_once).round() {
+            100.0 => "its place".into(),
+            percent => format!("{percent:.0} % of its place"),
         };
         eprintln!(
             "warning: the map has seen {place} only once: in other light or after a change it will err more there; record it \

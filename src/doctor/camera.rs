@@ -180,7 +180,7 @@ fn lens(look: &Look, calibration: Option<&DonutCalibration>) -> Option<Finding> 
     Some(Finding::ok("lens", format!("{found}, as calibrated")))
 }
 
-/// Whether localizing will take this for the lens of the map, by the same look.
+/// Whether localizing will take this for the lens of the map: by the same measures, on fewer frames.
 fn lens_of_map(look: &Look, info: &MapInfo) -> Option<Finding> {
     let facts = look.facts.as_ref()?;
     let size_px = [facts.width_px as usize, facts.height_px as usize];

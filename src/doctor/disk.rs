@@ -139,7 +139,7 @@ const IN_MEMORY: [i64; 3] = [0x0102_1994, 0x8584_58f6, 0x794c_7630];
 fn in_memory(folder: &Path) -> Option<Finding> {
     let kind = statfs(folder).ok()?.f_type as i64;
     IN_MEMORY.contains(&kind).then(|| {
-        let found = format!("{}: in memory (tmpfs or overlay)", folder.display());
+        let found = format!("{}: on tmpfs, or an overlay that may be in memory", folder.display());
         let advice = "recordings would be gone with the power: a partition of its own, and overlayroot=tmpfs:recurse=0";
         Finding::warning("disk", found, advice)
     })

@@ -51,14 +51,20 @@ impl SystemMonitor {
 /// Realtime before this, 2020, is that of a computer that was never told the date.
 const LEAST_REALTIME_NS: i64 = 1_577_836_800_000_000_000;
 
+/// A clock with a battery agrees with realtime to this: one whose battery is empty, or was never put in, starts in 1970 \[s\].
+const BATTERY_CLOCK_S: u64 = 3600;
+
 /// Whether realtime may be taken for UTC. Without a battery clock a computer starts with the date at which it was switched
 /// off, until systemd-timesyncd, where that keeps the time, has heard a better one.
 pub fn knows_date(realtime_ns: i64) -> bool {
-    realtime_ns >= LEAST_REALTIME_NS && is_kept(Path::new("/"))
+    realtime_ns >= LEAST_REALTIME_NS && is_kept(Path::new("/"), realtime_ns)
 }
 
-fn is_kept(root: &Path) -> bool {
-    let has_battery = fs::read_to_string(root.join("sys/class/rtc/rtc0/hctosys")).is_ok_and(|text| text.trim() == "1");
+fn is_kept(root: &Path, realtime_ns: i64) -> bool {
+    let clock = root.join("sys/class/rtc/rtc0");
+    let read = |name: &str| fs::read_to_string(clock.join(name)).ok().and_then(|text| text.trim().parse::<i64>().ok());
+    let has_battery = read("hctosys") == Some(1)
+        && read("since_epoch").is_some_and(|s| (realtime_ns / NS_PER_S as i64).abs_diff(s) <= BATTERY_CLOCK_S);
     let timesync = root.join("run/systemd/timesync");
     has_battery || !timesync.exists() || timesync.join("synchronized").exists()
 }
@@ -121,22 +127,26 @@ mod tests {
 
     #[test]
     fn the_date_of_the_last_switching_off_is_no_date() {
+        const NOW_NS: i64 = 1_790_000_000 * NS_PER_S as i64;
         let root = tempfile::tempdir().expect("a folder");
         let write = |path: &str, text: &str| {
             let path = root.path().join(path);
             fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
             fs::write(path, text).expect("writes");
         };
-        assert!(is_kept(root.path()), "by something else than systemd-timesyncd");
+        assert!(is_kept(root.path(), NOW_NS), "by something else than systemd-timesyncd");
         fs::create_dir_all(root.path().join("run/systemd/timesync")).expect("a folder");
-        assert!(!is_kept(root.path()), "it has heard of none yet");
+        assert!(!is_kept(root.path(), NOW_NS), "it has heard of none yet");
         write("sys/class/rtc/rtc0/hctosys", "0\n");
-        assert!(!is_kept(root.path()), "a clock that the kernel did not take the time of");
+        assert!(!is_kept(root.path(), NOW_NS), "a clock that the kernel did not take the time of");
         write("run/systemd/timesync/synchronized", "");
-        assert!(is_kept(root.path()));
+        assert!(is_kept(root.path(), NOW_NS));
         fs::remove_file(root.path().join("run/systemd/timesync/synchronized")).expect("removes");
         write("sys/class/rtc/rtc0/hctosys", "1\n");
-        assert!(is_kept(root.path()), "a clock with a battery");
+        write("sys/class/rtc/rtc0/since_epoch", "40\n");
+        assert!(!is_kept(root.path(), NOW_NS), "a clock without a battery");
+        write("sys/class/rtc/rtc0/since_epoch", "1789999990\n");
+        assert!(is_kept(root.path(), NOW_NS), "a clock with a battery");
         assert!(!knows_date(LEAST_REALTIME_NS - 1));
     }
 

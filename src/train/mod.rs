@@ -102,9 +102,9 @@ pub fn train(
         })
     });
     let validation = validation.collect();
-    let (temperature, gap_ratio) = match temperature_between_recordings(survey, &trial)? {
-        Some(temperature) => (temperature, 1.0),
-        None => (outcomes.temperature.unwrap_or(1.0), HELD_BACK_GAP_RATIO),
+    let (temperature, gap_ratio) = match (temperature_between_recordings(survey, &trial)?, outcomes.temperature) {
+        (None, Some(temperature)) if settings.split == SplitKind::Random => (temperature, HELD_BACK_GAP_RATIO),
+        (between, held_back) => (between.or(held_back).unwrap_or(1.0), 1.0),
     };
     let least_resemblance = outcomes.least_resemblance.map(|resemblance| resemblance / temperature);
 

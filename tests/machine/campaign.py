@@ -268,7 +268,7 @@ def first_pair(machine: Machine) -> None:
 
 @contextlib.contextmanager
 def pins_configured(machine: Machine):
-    """With the keys of the pins in the settings, and with /dev/gpiomem; both are taken back."""
+    """With the keys of the pins in the settings, and with /dev/gpiomem; both are taken back unless something failed."""
     driver = "/sys/bus/platform/drivers/simple-framebuffer"
     device = GPIOMEM.rpartition("/")[2]
     machine.sh(f"echo simple-framebuffer >{GPIOMEM}/driver_override && echo {device} >{driver}/bind")

@@ -245,6 +245,7 @@ class Machine:
 
     def power_on(self, plugged: bool) -> None:
         """Switches it on, with camera and receiver there from the start or not, and waits until it takes commands."""
+        self.agent = self.monitor = self.header = None
         for name in ("agent", "monitor", "pins", "pictures"):
             (self.folder / name).unlink(missing_ok=True)
         kernel = "console=ttyAMA0 quiet panic=-1 systemd.show_status=0 net.ifnames=0"
@@ -284,7 +285,9 @@ class Machine:
         self.monitor = Monitor(self.folder / "monitor")
         self.agent = Agent(self.folder / "agent")
         parts = self.monitor.ask("qom-list", path="/machine/unattached")
-        interrupts = next(part["name"] for part in parts if part["type"] == "child<arm-gicv3>")
+        interrupts = next((part["name"] for part in parts if part["type"] == "child<arm-gicv3>"), None)
+        if interrupts is None:
+            raise Failure(f"QEMU's machine has no interrupt controller: {parts}")
         self.header = Header(self.folder / "pins", f"/machine/unattached/{interrupts}")
         self.agent.wait_until_up(self.BOOT_LIMIT_S)
 
@@ -297,7 +300,8 @@ class Machine:
 
     def hang_up(self) -> None:
         for line in (self.agent, self.monitor, self.header):
-            line.close()
+            if line:
+                line.close()
 
     def shut_down(self) -> None:
         """As `poweroff` does."""
@@ -315,6 +319,8 @@ class Machine:
         self.monitor.wait_for("DEVICE_DELETED")
 
     def try_sh(self, script: str, timeout_s: float = 60) -> tuple[int, str, str]:
+        if not self.agent:
+            raise Failure("the machine is not on")
         return self.agent.run(script, timeout_s)
 
     def sh(self, script: str, timeout_s: float = 60) -> str:

@@ -14,8 +14,8 @@ use crate::types::distance_m;
 
 /// A point is where so many sightings around the frame meet.
 const PLACED_BY: usize = 10;
-/// Sightings that are joined at most of either pass: what is followed drifts. The other pass must see it more than once, as
-/// one sighting can always meet the others somewhere near.
+/// Sightings that are joined at most of the point's own pass, and of others: what is followed drifts. Others must see it more
+/// than once, as one sighting can always meet the rest somewhere near.
 const MOST_OF_A_PASS: usize = 5;
 const FEWEST_OF_OTHER: usize = 2;
 

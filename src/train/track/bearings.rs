@@ -51,6 +51,11 @@ pub struct Frames<'a> {
 }
 
 impl PointTrack {
+    /// The rows that see it.
+    pub fn rows(&self) -> impl Iterator<Item = usize> {
+        self.bearings.iter().map(|&(row, _)| row)
+    }
+
     /// Of the sightings of rows `first`, `first` + 1, …
     pub fn gather(first: usize, sightings: &[Vec<Sighting>]) -> Vec<Self> {
         let mut of_point: BTreeMap<usize, Self> = BTreeMap::new();

@@ -194,20 +194,26 @@ impl TrackSmoother {
         if !joined.is_empty() {
             solution = self.refined(layout, &equations, &used, &joined, solution)?;
         }
-        let tracks = self.with_receivers(layout, &seeing, &solution);
+        // A single pass bends as its receiver does: of that nothing can be learned.
+        let tied: Vec<usize> = joined.iter().flat_map(PointTrack::rows).map(|row| self.recording[row]).collect();
+        let tracks = self.with_receivers(layout, &tied, &solution);
         let layout = &Layout::new(&tracks, self.positions_m.len());
         let mut equations = self.equations(layout, &seeing);
         equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
-        let doubted = self.refined(layout, &equations, &used, &joined, solution.clone())?;
-        Some(Adjusted { solution, doubted: (tracks, doubted), views })
+        let doubted = self.refined(layout, &equations, &used, &joined, solution.clone());
+        let doubted = match doubted {
+            Some(doubted) => (tracks, doubted),
+            None => (self.tracks.clone(), solution.clone()),
+        };
+        Some(Adjusted { solution, doubted, views })
     }
 
-    /// The tracks, with receivers as the errors of the recordings `seeing` show them.
-    fn with_receivers(&self, layout: &Layout, seeing: &[usize], solution: &Solution) -> Vec<RecordingTrack> {
+    /// The tracks, with receivers as the errors of the recordings `tied` show them.
+    fn with_receivers(&self, layout: &Layout, tied: &[usize], solution: &Solution) -> Vec<RecordingTrack> {
         let mut tracks = self.tracks.clone();
         for RecordingTrack { rows, track } in &mut tracks {
             let Ok(track) = track else { continue };
-            if !seeing.contains(&self.recording[rows.start]) {
+            if !tied.contains(&self.recording[rows.start]) {
                 continue;
             }
             let of_row = |first: &Option<usize>| first.map(|first| [0, 1].map(|axis| solution.unknowns[first + axis]));
