@@ -1,7 +1,7 @@
 //! The commands: one file each. Results go to stdout, diagnostics to stderr.
 
-pub mod appearances;
-mod calibrate;
+mod appearances;
+pub mod calibrate;
 pub mod check;
 pub mod completions;
 pub mod demo;

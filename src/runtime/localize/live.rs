@@ -222,12 +222,6 @@ fn start_localizer(
     std::thread::Builder::new().name("localizer".into()).spawn(run).context("starting the thread localizer")
 }
 
-/// UTC of a stamp by the computer's clock.
-fn utc_ns(clock: &dyn Clock, stamp_ns: u64) -> i64 {
-    let now = clock.read();
-    now.realtime_ns - (now.monotonic_ns as i64 - stamp_ns as i64)
-}
-
 /// Whether the clock is right, looked at once a second.
 #[derive(Clone)]
 struct DateWatch {
@@ -249,8 +243,11 @@ impl DateWatch {
         self.is_known.store(is_known, Ordering::Relaxed);
     }
 
+    /// UTC of a stamp, if it is known.
     fn utc_ns(&self, stamp_ns: u64) -> Option<i64> {
-        self.is_known.load(Ordering::Relaxed).then(|| utc_ns(&*self.clock, stamp_ns))
+        let now = self.clock.read();
+        let utc_ns = now.realtime_ns - (now.monotonic_ns as i64 - stamp_ns as i64);
+        self.is_known.load(Ordering::Relaxed).then_some(utc_ns)
     }
 }
 

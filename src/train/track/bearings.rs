@@ -141,8 +141,8 @@ impl Frames<'_> {
     /// n_i·(δL + b_i − b_i°) / d_i + ε_i + κ = β_i − atan2(L − p_i)
     /// ```
     ///
-    /// with the errors b of the positions, ε of the yaw, κ of the recording's camera. Multiplied by an orthogonal matrix that makes
-    /// the first two of them the only ones with the point's own δL, which are left out (Mourikis & Roumeliotis 2007,
+    /// with the errors b of the positions, ε of the yaw, κ of the recording's camera. Multiplied by an orthogonal matrix that
+    /// makes the first two of them the only ones with the point's own δL, which are left out (Mourikis & Roumeliotis 2007,
     /// section III-D).
     fn equations_of(&self, bearings: &[(usize, f64)]) -> Option<Vec<Equation>> {
         let Triangulated { point_m, misses, weights } = self.triangulated(bearings)?;

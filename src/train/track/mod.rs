@@ -28,6 +28,7 @@ mod receiver;
 mod skyline;
 mod views;
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 
 use across::Across;
@@ -93,8 +94,8 @@ pub struct Smoothed {
 
 struct Adjusted {
     solution: Solution,
-    /// The tracks with the noise that their receivers may have, and what is known with that.
-    doubted: (Vec<RecordingTrack>, Solution),
+    /// The tracks with the noise that their receivers may have, and what is known with that; `None` where nothing shows it.
+    doubted: Option<(Vec<RecordingTrack>, Solution)>,
     views: Vec<View>,
 }
 
@@ -142,10 +143,14 @@ impl TrackSmoother {
     pub fn smoothed(&self, learned: &[usize], similarity: Option<&Similarity>) -> Smoothed {
         let layout = Layout::new(&self.tracks, self.positions_m.len());
         let adjusted = if layout.found.is_empty() { None } else { self.adjusted(&layout, learned, similarity) };
-        let Some(Adjusted { solution, doubted: (tracks, doubted), views }) = adjusted else { return self.left_alone() };
+        let Some(Adjusted { solution, doubted, views }) = adjusted else { return self.left_alone() };
+        let (tracks, known) = match &doubted {
+            Some((tracks, doubted)) => (tracks, doubted),
+            None => (&self.tracks, &solution),
+        };
 
         let positions_m = self.corrected(&layout, &solution.unknowns);
-        let remaining_std_m = self.remaining_std_m(&layout, learned, &doubted);
+        let remaining_std_m = self.remaining_std_m(&layout, learned, known);
         let report = |of: &RecordingTrack| match &of.track {
             Err(why) => TrackReport::LeftAlone(*why),
             Ok(track) => {
@@ -191,25 +196,22 @@ impl TrackSmoother {
             solution = self.refined(layout, &equations, &used, &[], solution)?;
         }
         let joined = self.joined(layout, &used, &solution);
-        if !joined.is_empty() {
-            solution = self.refined(layout, &equations, &used, &joined, solution)?;
+        if joined.is_empty() {
+            return Some(Adjusted { solution, doubted: None, views });
         }
-        // A single pass bends as its receiver does: of that nothing can be learned.
-        let tied: Vec<usize> = joined.iter().flat_map(PointTrack::rows).map(|row| self.recording[row]).collect();
-        let tracks = self.with_receivers(layout, &tied, &solution);
+        let solution = self.refined(layout, &equations, &used, &joined, solution)?;
+        let tracks = self.with_receivers(layout, &joined, &solution);
         let layout = &Layout::new(&tracks, self.positions_m.len());
         let mut equations = self.equations(layout, &seeing);
         equations.extend(views.iter().map(|view| view.equation(&self.positions_m, &layout.first)));
         let doubted = self.refined(layout, &equations, &used, &joined, solution.clone());
-        let doubted = match doubted {
-            Some(doubted) => (tracks, doubted),
-            None => (self.tracks.clone(), solution.clone()),
-        };
-        Some(Adjusted { solution, doubted, views })
+        Some(Adjusted { solution, doubted: doubted.map(|doubted| (tracks, doubted)), views })
     }
 
-    /// The tracks, with receivers as the errors of the recordings `tied` show them.
-    fn with_receivers(&self, layout: &Layout, tied: &[usize], solution: &Solution) -> Vec<RecordingTrack> {
+    /// The tracks, with receivers as the errors of the recordings that `joined` ties show them. A single pass bends as its
+    /// receiver does: of that nothing can be learned.
+    fn with_receivers(&self, layout: &Layout, joined: &[PointTrack], solution: &Solution) -> Vec<RecordingTrack> {
+        let tied: BTreeSet<usize> = joined.iter().flat_map(PointTrack::rows).map(|row| self.recording[row]).collect();
         let mut tracks = self.tracks.clone();
         for RecordingTrack { rows, track } in &mut tracks {
             let Ok(track) = track else { continue };
